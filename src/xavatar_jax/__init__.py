@@ -1,0 +1,33 @@
+"""xavatar_jax: animatable implicit avatars of one person, in JAX."""
+
+from ._version import __version__ as __version__
+from .avatar import Avatar as Avatar
+from .avatar import CellSizes as CellSizes
+from .avatar import evaluate as evaluate
+from .avatar import fit as fit
+from .avatar import load_avatar as load_avatar
+from .body import BodyModel as BodyModel
+from .body import BodyParams as BodyParams
+from .body import bone_transforms as bone_transforms
+from .body import canonical_params as canonical_params
+from .body import load_body as load_body
+from .body import pose_body as pose_body
+from .body import synthetic_body as synthetic_body
+from .correspondence import Broyden as Broyden
+from .correspondence import find_correspondences as find_correspondences
+from .correspondence import part_groups as part_groups
+from .datasets import load_data as load_data
+from .datasets import load_frames as load_frames
+from .datasets import synthetic_capture as synthetic_capture
+from .export import read_mesh as read_mesh
+from .export import write_obj as write_obj
+from .export import write_ply as write_ply
+from .frames import Frame as Frame
+from .frames import Frames as Frames
+from .kinematics import skin_points as skin_points
+from .meshing import Mesh as Mesh
+from .motion import Motion as Motion
+from .motion import load_motion as load_motion
+from .training import FitConfig as FitConfig
+from .training import paper as paper
+from .training import quick as quick

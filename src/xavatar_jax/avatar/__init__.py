@@ -1,0 +1,10 @@
+"""Avatars: fit, query, pose, evaluate, save and load."""
+
+from .avatar import Avatar as Avatar
+from .avatar import CellSizes as CellSizes
+from .evaluate import Evaluation as Evaluation
+from .evaluate import evaluate as evaluate
+from .fit import Fit as Fit
+from .fit import fit as fit
+from .query import Query as Query
+from .store import load_avatar as load_avatar

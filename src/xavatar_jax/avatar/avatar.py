@@ -1,0 +1,314 @@
+"""An avatar: a body, a shape and the fields learned for them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import (
+    BODY,
+    FACES,
+    HANDS,
+    BodyModel,
+    BodyParams,
+    bone_transforms,
+    canonical_params,
+    canonical_vertices,
+    check_params,
+    pose_body,
+)
+from ..correspondence import StartSet
+from ..fields import TabulatedSkinning
+from ..geometry import nearest_vertices
+from ..kinematics import skin_points
+from ..meshing import Mesh, extract_surface
+from ..training import AvatarFields, FitConfig
+from ..training.pool import tabulate_for_search
+from .query import Query, query_posed
+
+_BATCH = 16_384
+MAX_VERTICES = 50_000
+
+
+@dataclass(frozen=True)
+class CellSizes:
+    """Edges of extraction cells by part, metres."""
+
+    body: float = 0.008
+    head: float = 0.004
+    face: float = 0.002
+    hands: float = 0.002
+
+    def scaled(self, factor: float) -> CellSizes:
+        return CellSizes(*(factor * v for v in (self.body, self.head, self.face, self.hands)))
+
+
+@dataclass(frozen=True)
+class Avatar:
+    """A person's fields on a body. Made by `fit`, or read by `load_avatar`.
+
+    - `betas`: the shape whose skeleton is driven, `(S,)`.
+    - `fields`: skinning and geometry in the canonical space of that shape.
+    - `steps`: training steps that the fields have seen.
+    """
+
+    body: BodyModel
+    betas: Float[np.ndarray, " S"]
+    fields: AvatarFields
+    config: FitConfig
+    steps: int = 0
+
+    def skin_weights(self, points: Float[Array, "N 3"]) -> Float[Array, "N J"]:
+        """Learned skinning weights at canonical points, metres."""
+        return _skin_weights(self.fields, jnp.asarray(points))
+
+    def query(
+        self, points: Float[Array, "N 3"], params: BodyParams, *, starts: StartSet = "part_aware"
+    ) -> Query:
+        """Everything the fields say of posed points: logit, canonical point, whether found.
+
+        Differentiable in points and parameters. A point's part, which decides the bones that
+        start its search, is that of the nearest vertex of the posed body.
+        """
+        points = jnp.asarray(points, jnp.float32)
+        return query_posed(
+            self.fields,
+            self._table,
+            self.body,
+            points,
+            self._parts_of(points, params),
+            self._own(params),
+            starts,
+        )
+
+    def occupancy(
+        self, points: Float[Array, "N 3"], params: BodyParams, *, starts: StartSet = "part_aware"
+    ) -> Float[Array, " N"]:
+        """Occupancy of posed points, 0 to 1, differentiable in points and parameters.
+
+        A point that no bone leads to a canonical point is outside: 0.
+        """
+        answer = self.query(points, params, starts=starts)
+        return jnp.where(answer.found, jax.nn.sigmoid(answer.logit), 0.0)
+
+    def canonical_mesh(
+        self,
+        params: BodyParams | None = None,
+        *,
+        cell: CellSizes | float | None = None,
+        max_vertices: int | None = MAX_VERTICES,
+    ) -> Mesh:
+        """The surface in canonical space, under one frame's pose and expression if given.
+
+        With the default cells the surface of the neutral person is extracted once; under other
+        parameters its vertices move along the field's gradient on to the surface asked for, so
+        that all meshes have the same faces.
+
+        **Raises:** `EmptyLevelSetError` if there is no surface.
+        """
+        default = cell is None and max_vertices == MAX_VERTICES
+        base = self._base_mesh if default else self._extract_canonical(cell, max_vertices)
+        if params is None:
+            return base
+        check_params(self.body, params)
+        condition = self.fields.geometry.condition(self._own(params))
+        vertices = _in_batches(
+            lambda x: _project(self.fields, x, condition), base.vertices, self._batch
+        )
+        return Mesh(vertices, base.faces)
+
+    def mesh(
+        self,
+        params: BodyParams,
+        *,
+        mode: Literal["fast", "full"] = "fast",
+        cell: CellSizes | float | None = None,
+        max_vertices: int | None = MAX_VERTICES,
+    ) -> Mesh:
+        """The posed surface of one frame, metres.
+
+        `fast` skins the canonical mesh; its topology is the same in every frame. `full` extracts
+        the posed field itself, with a search at every sample: slower by far, and right where
+        parts touch.
+
+        **Raises:** `ValueError` for parameters that do not fit the body; `EmptyLevelSetError`.
+        """
+        check_params(self.body, params)
+        if mode == "fast":
+            canonical = self.canonical_mesh(params, cell=cell, max_vertices=max_vertices)
+            transforms = bone_transforms(self.body, self._own(params))
+            vertices = _in_batches(
+                lambda x: _pose(self.fields, x, transforms), canonical.vertices, self._batch
+            )
+            return Mesh(vertices, canonical.faces)
+        if mode == "full":
+            return self._extract_posed(params, cell, max_vertices)
+        raise ValueError(f"unknown mode {mode!r}: fast or full")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the avatar to one file, without the body's arrays: see `load_avatar`."""
+        from .store import save_avatar
+
+        save_avatar(self, path)
+
+    @property
+    def _batch(self) -> int:
+        return _BATCH if self.config.geometry.kind == "hash" else 4096
+
+    @cached_property
+    def _table(self) -> TabulatedSkinning:
+        return tabulate_for_search(self.body, self.fields.skinning, self.config)
+
+    @cached_property
+    def _base_mesh(self) -> Mesh:
+        return self._extract_canonical(None, MAX_VERTICES)
+
+    @cached_property
+    def _canonical_vertices(self) -> Float[np.ndarray, "V 3"]:
+        return np.asarray(canonical_vertices(self.body, jnp.asarray(self.betas)), np.float64)
+
+    def _own(self, params: BodyParams) -> BodyParams:
+        """Parameters with the avatar's shape in place of theirs: fields know one skeleton."""
+        betas = jnp.asarray(self.betas, params.pose.dtype)
+        return eqx.tree_at(lambda p: p.betas, params, betas)
+
+    def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
+        """Vertices of the body itself in this pose and the avatar's shape, metres."""
+        own = jax.lax.stop_gradient(self._own(params))
+        return np.asarray(_posed(self.body, own), np.float64)
+
+    def _parts_of(self, points: Array, params: BodyParams) -> np.ndarray:
+        template = self.posed_template(params)
+        _, nearest = nearest_vertices(template, np.asarray(jax.lax.stop_gradient(points)))
+        return np.asarray(self.body.part_labels)[nearest].astype(np.int32)
+
+    def _extract_canonical(
+        self, cell: CellSizes | float | None, max_vertices: int | None
+    ) -> Mesh:
+        neutral = canonical_params(self.body, jnp.asarray(self.betas))
+        condition = self.fields.geometry.condition(neutral)
+
+        def field(points: np.ndarray) -> np.ndarray:
+            return np.asarray(_logits(self.fields, jnp.asarray(points), condition))
+
+        def gradient(points: np.ndarray) -> np.ndarray:
+            return np.asarray(_gradients(self.fields, jnp.asarray(points), condition))
+
+        return self._extract(
+            field, gradient, self._canonical_vertices, cell, max_vertices, self._batch
+        )
+
+    def _extract_posed(
+        self, params: BodyParams, cell: CellSizes | float | None, max_vertices: int | None
+    ) -> Mesh:
+        template = self.posed_template(params)
+        batch = 4096
+
+        def field(points: np.ndarray) -> np.ndarray:
+            answer = self.query(jnp.asarray(points), params)
+            # Nowhere to be found is outside, by about the width of the learned step.
+            return np.asarray(jnp.where(answer.found, answer.logit, -10.0))
+
+        return self._extract(field, None, template, cell, max_vertices, batch)
+
+    def _extract(
+        self,
+        field: Any,
+        gradient: Any,
+        template: np.ndarray,
+        cell: CellSizes | float | None,
+        max_vertices: int | None,
+        batch: int,
+    ) -> Mesh:
+        sizes = CellSizes() if cell is None else cell
+        if not isinstance(sizes, CellSizes):
+            sizes = CellSizes(sizes, sizes, sizes, sizes)
+        wanted = self._cells_by_vertex(sizes)
+
+        def cell_at(points: np.ndarray) -> np.ndarray:
+            return wanted[nearest_vertices(template, points)[1]]
+
+        margin = 0.08
+        mesh = extract_surface(
+            field,
+            np.stack([template.min(0) - margin, template.max(0) + margin]),
+            cell=float(wanted.min()),
+            cell_at=cell_at,
+            seeds=template,
+            gradient=gradient,
+            batch_points=batch,
+            max_vertices=max_vertices,
+            project_steps=1 if gradient is not None else 0,
+        )
+        return mesh.largest_component()
+
+    def _cells_by_vertex(self, sizes: CellSizes) -> np.ndarray:
+        labels = np.asarray(self.body.part_labels)
+        wanted = np.full(len(labels), sizes.body)
+        head = self.body.tree.indices("head")
+        if head:
+            # The whole head, ears and hair too: its shapes are finer than a limb's.
+            on_head = np.asarray(self.body.weights)[:, self.body.tree.subtree(head[0])].sum(1)
+            wanted[(labels == BODY) & (on_head > 0.5)] = sizes.head
+        wanted[np.isin(labels, FACES)] = sizes.face
+        wanted[np.isin(labels, HANDS)] = sizes.hands
+        return wanted
+
+
+_posed = eqx.filter_jit(lambda body, params: pose_body(body, params).vertices)
+
+
+@eqx.filter_jit
+def _skin_weights(fields: AvatarFields, points: Array) -> Array:
+    return jax.vmap(fields.skinning)(points)
+
+
+@eqx.filter_jit
+def _logits(fields: AvatarFields, points: Array, condition: Any) -> Array:
+    return jax.vmap(lambda x: fields.geometry(x, condition))(points)
+
+
+@eqx.filter_jit
+def _gradients(fields: AvatarFields, points: Array, condition: Any) -> Array:
+    return jax.vmap(jax.grad(lambda x: fields.geometry(x, condition)))(points)
+
+
+@eqx.filter_jit
+def _project(fields: AvatarFields, points: Array, condition: Any) -> Array:
+    """Move points on to the level set by Newton steps along the gradient, 3 mm a step at most."""
+
+    def value(x: Array) -> Array:
+        return fields.geometry(x, condition)
+
+    def one(x: Array) -> Array:
+        for _ in range(3):
+            f, g = jax.value_and_grad(value)(x)
+            slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
+            x = x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
+        return x
+
+    return jax.vmap(one)(points)
+
+
+@eqx.filter_jit
+def _pose(fields: AvatarFields, points: Array, transforms: Array) -> Array:
+    return jax.vmap(lambda x: skin_points(x, fields.skinning(x), transforms))(points)
+
+
+def _in_batches(function: Any, points: np.ndarray, batch: int) -> np.ndarray:
+    """Apply a jitted function to fixed-size batches, the last one padded: no retracing."""
+    count = len(points)
+    padded = np.concatenate([points, np.repeat(points[:1], -count % batch, axis=0)])
+    parts = [
+        np.asarray(function(jnp.asarray(padded[k : k + batch], jnp.float32)))
+        for k in range(0, len(padded), batch)
+    ]
+    return np.concatenate(parts)[:count]

@@ -1,0 +1,112 @@
+"""Avatars in one file: config, learned arrays, and which body they belong to. No pickle."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+
+
+
+from .._version import __version__
+from ..body import BodyModel, load_body, synthetic_body
+from ..fields import HashGeometry
+from ..files import flatten_named, load_arrays, save_arrays, unflatten_named
+from ..training import (
+    AvatarFields,
+    config_from_dict,
+    config_to_dict,
+    fresh_fields,
+    settle_on_person,
+    trainable_filter,
+)
+from .avatar import Avatar
+
+_FORMAT = 1
+
+
+def save_avatar(avatar: Avatar, path: str | os.PathLike[str]) -> None:
+    """Write an avatar: learned arrays, shape, config and the body's path, kind, gender, checksum.
+
+    The body's own arrays, which are licensed, and what is derived from them are left out.
+    """
+    arrays = flatten_named(_kept(avatar.fields, avatar))
+    source = avatar.body.source
+    header = {
+        "format": _FORMAT,
+        "kind": "avatar",
+        "version": __version__,
+        "steps": avatar.steps,
+        "config": config_to_dict(avatar.config),
+        "body": {
+            "path": source.path,
+            "kind": source.kind,
+            "gender": source.gender,
+            "checksum": source.checksum,
+            "num_betas": avatar.body.num_betas,
+            "num_expression": avatar.body.num_expression,
+        },
+    }
+    save_arrays(path, {"betas": avatar.betas, **arrays}, header)
+
+
+def load_avatar(path: str | os.PathLike[str], *, body: BodyModel | None = None) -> Avatar:
+    """Read an avatar written by `Avatar.save`.
+
+    Without `body` the model file it was learned on is loaded again; the bundled body is made anew
+    if need be.
+
+    **Raises:** `FileNotFoundError` if the body's file is gone, `ValueError` if the body given, or
+    the file found, is another one, or if the avatar file is damaged or from a newer version.
+    """
+    arrays, header = load_arrays(path)
+    if header.get("kind") != "avatar":
+        raise ValueError(f"{os.fspath(path)}: not an avatar file")
+    if header["format"] > _FORMAT:
+        raise ValueError(
+            f"{os.fspath(path)}: written by xavatar_jax {header['version']} in format "
+            f"{header['format']}; this version ({__version__}) reads up to {_FORMAT}"
+        )
+    known = header["body"]
+    body = _find_body(path, known) if body is None else body
+    if body.source.checksum != known["checksum"]:
+        raise ValueError(
+            f"{os.fspath(path)}: learned on another body. It needs {known['kind']} "
+            f"({known['gender']}), checksum {known['checksum'][:12]}..., once at {known['path']}; "
+            f"given was {body.source.describe()}, checksum {body.source.checksum[:12]}..."
+        )
+    config = config_from_dict(header["config"])
+    betas = arrays.pop("betas")
+    fields = settle_on_person(body, fresh_fields(body, config), betas, config)
+    avatar = Avatar(body, betas, fields, config, header["steps"])
+    kept = unflatten_named(_kept(fields, avatar), arrays, source=os.fspath(path))
+    return Avatar(body, betas, eqx.combine(kept, fields), config, header["steps"])
+
+
+def _kept(fields: AvatarFields, avatar: Avatar) -> AvatarFields:
+    """Leaves that the file holds: all learned ones, whether or not this run has learned them."""
+    kept = trainable_filter(fields, avatar.config)
+    if isinstance(fields.geometry, HashGeometry):
+        kept = eqx.tree_at(lambda f: f.geometry.joints, kept, True)
+    return eqx.filter(fields, kept)
+
+
+def _find_body(path: str | os.PathLike[str], known: dict[str, Any]) -> BodyModel:
+    file = Path(known["path"])
+    if file.exists():
+        return load_body(
+            file,
+            gender=known["gender"],
+            num_betas=known["num_betas"],
+            num_expression=known["num_expression"],
+        )
+    if file.name.startswith("synthetic_body"):
+        return synthetic_body()
+    raise FileNotFoundError(
+        f"{os.fspath(path)}: its body model is not at {file} any more. Pass the {known['kind']} "
+        f"({known['gender']}) model it was learned on: load_avatar(path, body=load_body(...))"
+    )
+
+

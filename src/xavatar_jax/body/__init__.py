@@ -1,0 +1,35 @@
+"""Body models of the SMPL family and any other tree: parameters, loading, posing."""
+
+from .hands import hands_to_absolute as hands_to_absolute
+from .hands import hands_to_relative as hands_to_relative
+from .joints import SMPL_TREE as SMPL_TREE
+from .joints import SMPLH_TREE as SMPLH_TREE
+from .joints import SMPLX_TREE as SMPLX_TREE
+from .joints import mano_tree as mano_tree
+from .joints import pose_groups as pose_groups
+from .load import load_body as load_body
+from .load import synthetic_body as synthetic_body
+from .model import BodyModel as BodyModel
+from .model import BodySource as BodySource
+from .model import Posed as Posed
+from .model import bone_transforms as bone_transforms
+from .model import canonical_joints as canonical_joints
+from .model import canonical_params as canonical_params
+from .model import canonical_pose as canonical_pose
+from .model import canonical_vertices as canonical_vertices
+from .model import pose_body as pose_body
+from .model import pose_offsets as pose_offsets
+from .model import rest_joints as rest_joints
+from .model import rest_vertices as rest_vertices
+from .model import with_template as with_template
+from .params import BodyParams as BodyParams
+from .params import check_params as check_params
+from .parts import BODY as BODY
+from .parts import EYES_MOUTH as EYES_MOUTH
+from .parts import FACE as FACE
+from .parts import FACES as FACES
+from .parts import HANDS as HANDS
+from .parts import LEFT_HAND as LEFT_HAND
+from .parts import PARTS as PARTS
+from .parts import RIGHT_HAND as RIGHT_HAND
+from .parts import derive_part_labels as derive_part_labels

@@ -1,0 +1,65 @@
+"""Joint names and trees of the SMPL family, as data."""
+
+from __future__ import annotations
+
+from ..kinematics import KinematicTree
+
+_BODY = (
+    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2"),
+    *("left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck"),
+    *("left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
+    *("left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+)
+_BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+
+
+def _hand_names(side: str) -> tuple[str, ...]:
+    return tuple(f"{side}_{finger}{k}" for finger in FINGERS for k in (1, 2, 3))
+
+
+def _hand_parents(wrist: int, first: int) -> tuple[int, ...]:
+    return tuple(wrist if k % 3 == 0 else first + k - 1 for k in range(15))
+
+
+SMPLX_TREE = KinematicTree(
+    (*_BODY, "jaw", "left_eye", "right_eye", *_hand_names("left"), *_hand_names("right")),
+    (*_BODY_PARENTS, 15, 15, 15, *_hand_parents(20, 25), *_hand_parents(21, 40)),
+)
+SMPLH_TREE = KinematicTree(
+    (*_BODY, *_hand_names("left"), *_hand_names("right")),
+    (*_BODY_PARENTS, *_hand_parents(20, 22), *_hand_parents(21, 37)),
+)
+SMPL_TREE = KinematicTree((*_BODY, "left_hand", "right_hand"), (*_BODY_PARENTS, 20, 21))
+
+
+def mano_tree(side: str) -> KinematicTree:
+    """The 16 joints of one MANO hand; `side` is "left" or "right"."""
+    return KinematicTree((f"{side}_wrist", *_hand_names(side)), (-1, *_hand_parents(0, 1)))
+
+
+def pose_groups(tree: KinematicTree) -> dict[str, tuple[int, ...]]:
+    """Joints behind each of SMPL-X's parameter names, found by joint name.
+
+    A tree without hands, jaw or eyes has empty groups; every joint that belongs to no other
+    group is part of `body_pose`, so the groups cover any tree.
+    """
+    fingers = {
+        side: tuple(
+            j
+            for j, name in enumerate(tree.names)
+            if name.startswith(f"{side}_") and name[len(side) + 1 : -1] in FINGERS
+        )
+        for side in ("left", "right")
+    }
+    groups = {
+        "global_orient": (0,),
+        "jaw_pose": tree.indices("jaw"),
+        "leye_pose": tree.indices("left_eye"),
+        "reye_pose": tree.indices("right_eye"),
+        "left_hand_pose": fingers["left"],
+        "right_hand_pose": fingers["right"],
+    }
+    taken = {joint for group in groups.values() for joint in group}
+    groups["body_pose"] = tuple(j for j in range(tree.num_joints) if j not in taken)
+    return groups

@@ -1,0 +1,84 @@
+"""One entry for all layouts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from xavatar_jax.body import BodyModel
+from xavatar_jax.datasets.capture import Capture
+from xavatar_jax.datasets.folder import find_frames, load_folder
+from xavatar_jax.datasets.grab import find_motions, load_grab
+from xavatar_jax.datasets.prepared import find_subject, load_prepared
+from xavatar_jax.motion import load_motion
+
+_LAYOUTS = (
+    "train/*.npz and test/*.npz (AMASS or GRAB sequences)",
+    "*.npz (a subject's AMASS or GRAB sequences, to be split)",
+    "{train,test}/SEQUENCE/SMPLX/mesh-f*_smplx.{ply,pkl} (prepared), here or one folder down",
+    "NAME.ply|obj beside NAME.npz|pkl (meshes with parameters), subfolders as sequences",
+)
+
+
+def load_data(
+    data_dir: str | Path,
+    body: BodyModel,
+    *,
+    gender: str | None = None,
+    test: Sequence[str] | None = None,
+    split_seed: int = 0,
+    verbose: bool = False,
+) -> Capture:
+    """Load a capture in whichever known layout `data_dir` has.
+
+    Args:
+        data_dir: see `load_grab`, `load_prepared` and `load_folder` for the layouts.
+        body: the body the parameters are for.
+        gender: takes the place of what the files say.
+        test: names of sequences to hold out, where the folder is not split.
+        split_seed: chooses them otherwise.
+        verbose: show a progress bar.
+
+    Raises:
+        FileNotFoundError: no such folder, or no known layout in it; lists the layouts looked for
+            and what is there.
+        ValueError: as the loader of the layout.
+    """
+    data_dir = Path(data_dir)
+    if not data_dir.is_dir():
+        raise FileNotFoundError(f"No data folder at {data_dir}.")
+    options = {"gender": gender, "test": test, "split_seed": split_seed, "verbose": verbose}
+    if find_motions(data_dir):
+        return load_grab(data_dir, body, **options)
+    subject = find_subject(data_dir)
+    if subject is not None:
+        return load_prepared(subject, body, **options)
+    if find_frames(data_dir):
+        return load_folder(data_dir, body, **options)
+    raise FileNotFoundError(_unknown_layout(data_dir))
+
+
+def find_gender(data_dir: str | Path) -> str | None:
+    """The gender a capture's files state, to choose the body by; None where they state none.
+
+    Reads one sequence, or `gender.txt`.
+
+    Raises:
+        FileNotFoundError: no such folder.
+    """
+    data_dir = Path(data_dir)
+    if not data_dir.is_dir():
+        raise FileNotFoundError(f"No data folder at {data_dir}.")
+    motions = [file for files in find_motions(data_dir).values() for file in files]
+    if motions:
+        gender = load_motion(motions[0]).gender
+        return None if gender == "unknown" else gender
+    file = (find_subject(data_dir) or data_dir) / "gender.txt"
+    return file.read_text(encoding="utf-8").strip().lower() if file.is_file() else None
+
+
+def _unknown_layout(data_dir: Path) -> str:
+    present = sorted(p.name + ("/" if p.is_dir() else "") for p in data_dir.iterdir())
+    shown = ", ".join(present[:12]) + (f" and {len(present) - 12} more" if present[12:] else "")
+    wanted = "\n  ".join(_LAYOUTS)
+    return f"{data_dir}: no layout we know. Looked for\n  {wanted}\nFound: {shown or 'nothing'}."

@@ -1,0 +1,31 @@
+"""Fields in canonical space: skinning weights and geometry, and what they are made of."""
+
+from .encodings import HashEncoding as HashEncoding
+from .encodings import positional_encoding as positional_encoding
+from .geometry import AbstractGeometryField as AbstractGeometryField
+from .geometry import HashGeometry as HashGeometry
+from .geometry import MLPGeometry as MLPGeometry
+from .grids import GridSpacing as GridSpacing
+from .grids import PartGrids as PartGrids
+from .grids import build_part_grids as build_part_grids
+from .hierarchical import SOFT_BLEND as SOFT_BLEND
+from .hierarchical import hierarchical_logits as hierarchical_logits
+from .hierarchical import hierarchical_softmax as hierarchical_softmax
+from .hierarchical import num_logits as num_logits
+from .mlp import ImplicitMLP as ImplicitMLP
+from .mlp import MLPShape as MLPShape
+from .mlp import WeightNormLinear as WeightNormLinear
+from .mlp import sharp_softplus as sharp_softplus
+from .skinning import PAPER_SKINNING as PAPER_SKINNING
+from .skinning import AbstractSkinningField as AbstractSkinningField
+from .skinning import GridSkinning as GridSkinning
+from .skinning import MLPSkinning as MLPSkinning
+from .skinning import PosedGrid as PosedGrid
+from .skinning import TabulatedSkinning as TabulatedSkinning
+from .skinning import pose_grid as pose_grid
+from .skinning import skin_with_jacobian as skin_with_jacobian
+from .skinning import tabulate as tabulate
+from .template import body_part_grids as body_part_grids
+from .template import mean_canonical_vertices as mean_canonical_vertices
+from .template import template_grid_skinning as template_grid_skinning
+from .template import template_weights as template_weights

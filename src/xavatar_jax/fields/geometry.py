@@ -1,0 +1,183 @@
+"""Geometry fields: a canonical point to an occupancy logit, positive inside."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..body import BodyParams, pose_groups
+from ..kinematics import KinematicTree, axis_angle_to_matrix
+from .encodings import HashEncoding
+from .mlp import ImplicitMLP, MLPShape
+
+
+class AbstractGeometryField(eqx.Module):
+    """An occupancy logit in canonical space, conditioned on a frame's pose and expression."""
+
+    @abc.abstractmethod
+    def condition(self, params: BodyParams) -> Any:
+        """What the field keeps of one frame's parameters: arrays, computed once a frame."""
+
+    @abc.abstractmethod
+    def __call__(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, ""]:
+        """Logit at `x_c` (metres, canonical space) under one frame's condition."""
+
+
+class MLPGeometry(AbstractGeometryField):
+    """The paper's occupancy network, with its global condition (X-Avatar, section 3.1).
+
+    The condition is body pose over pi and expression; a hand without a body takes its own pose.
+    """
+
+    mlp: ImplicitMLP
+    joints: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        tree: KinematicTree,
+        num_expression: int,
+        shape: MLPShape,
+        *,
+        key: PRNGKeyArray,
+    ):
+        groups = pose_groups(tree)
+        hands = groups["left_hand_pose"] + groups["right_hand_pose"]
+        self.joints = groups["body_pose"] or hands
+        width = 3 * len(self.joints) + num_expression
+        self.mlp = ImplicitMLP(shape, condition=width, init="ball", key=key)
+
+    def condition(self, params: BodyParams) -> Float[Array, " c"]:
+        pose = params.pose[np.asarray(self.joints, int)].reshape(-1) / np.pi
+        return jnp.concatenate([pose.astype(params.expression.dtype), params.expression])
+
+    def __call__(self, x_c: Float[Array, "3"], condition: Float[Array, " c"]) -> Float[Array, ""]:
+        out, _ = self.mlp(x_c, condition)
+        return out[0]
+
+
+class HashGeometry(AbstractGeometryField):
+    """Feature grids and a small MLP, with a condition that is local to each joint.
+
+    A joint's rotation changes shape near that joint only: its features, linear in the entries of
+    the rotation less the identity (as pose blend shapes are), fade with the distance from the
+    joint over half the length of the bones that meet there. Expression reaches what hangs from
+    the head. Levels finer than the trunk needs are heard inside the boxes of `detail` alone.
+    """
+
+    encoding: HashEncoding
+    hidden: tuple[Float[Array, "out in"], ...]
+    biases: tuple[Float[Array, " out"], ...]
+    pose_weights: Float[Array, "J 9 K"]
+    expression_weights: Float[Array, "E K"]
+    joints: Float[Array, "J 3"]
+    reach: tuple[float, ...] = eqx.field(static=True)
+    detail_low: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
+    detail_high: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
+    detail_spacing: tuple[float, ...] = eqx.field(static=True)
+    trunk_spacing: float = eqx.field(static=True)
+    sharpness: float = eqx.field(static=True)
+    tree: KinematicTree = eqx.field(static=True)
+
+    def __init__(
+        self,
+        tree: KinematicTree,
+        joints: Float[np.ndarray, "J 3"],
+        num_expression: int,
+        low: Float[np.ndarray, "3"],
+        high: Float[np.ndarray, "3"],
+        *,
+        spacing: tuple[float, ...],
+        trunk_spacing: float,
+        detail: tuple[tuple[np.ndarray, np.ndarray, float], ...],
+        features: int,
+        log2_size: int,
+        width: int,
+        condition_width: int,
+        sharpness: float,
+        key: PRNGKeyArray,
+    ):
+        keys = jax.random.split(key, 4)
+        self.encoding = HashEncoding(
+            low, high, spacing=spacing, features=features, log2_size=log2_size, key=keys[0]
+        )
+        fan_in = (self.encoding.width + condition_width, width, width)
+        fan_out = (width, width, 1)
+        self.hidden = tuple(
+            jax.random.normal(k, (m, n)) * np.sqrt(2 / n)
+            for k, n, m in zip(keys[1:], fan_in, fan_out, strict=True)
+        )
+        self.biases = tuple(jnp.zeros(m) for m in fan_out)
+        # Silent at first: the start is the same surface in every pose.
+        self.pose_weights = jnp.zeros((tree.num_joints, 9, condition_width))
+        self.expression_weights = jnp.zeros((num_expression, condition_width))
+        self.joints = jnp.asarray(joints, jnp.float32)
+        self.reach = _joint_reach(tree, joints)
+        self.detail_low = _triples([box[0] for box in detail])
+        self.detail_high = _triples([box[1] for box in detail])
+        self.detail_spacing = tuple(float(box[2]) for box in detail)
+        self.trunk_spacing = trunk_spacing
+        self.sharpness = sharpness
+        self.tree = tree
+
+    def condition(self, params: BodyParams) -> Float[Array, "J K"]:
+        """One row a joint, so that a point's condition is its weights times these rows."""
+        rotations = axis_angle_to_matrix(params.pose)
+        feature = (rotations - jnp.eye(3, dtype=rotations.dtype)).reshape(-1, 9).at[0].set(0)
+        rows = jnp.einsum("jf,jfk->jk", feature, self.pose_weights)
+        head = self.tree.indices("head")
+        reached = self.tree.subtree(head[0]) if head else range(self.tree.num_joints)
+        return rows.at[np.asarray(reached)].add(params.expression @ self.expression_weights)
+
+    def __call__(
+        self, x_c: Float[Array, "3"], condition: Float[Array, "J K"]
+    ) -> Float[Array, ""]:
+        features = self.encoding(x_c) * self._level_mask(x_c)[:, None]
+        local = self._nearness(x_c) @ condition
+        h = jnp.concatenate([features.reshape(-1), local])
+        last = len(self.hidden) - 1
+        for k, (weight, bias) in enumerate(zip(self.hidden, self.biases, strict=True)):
+            h = weight @ h + bias
+            if k < last:
+                h = jax.nn.softplus(self.sharpness * h) / self.sharpness
+        return h[0]
+
+    def _nearness(self, x: Float[Array, "3"]) -> Float[Array, " J"]:
+        """How much of each joint's condition is heard at `x`: a Gaussian of the distance."""
+        away = x - jax.lax.stop_gradient(self.joints).astype(x.dtype)
+        return jnp.exp(-0.5 * (away**2).sum(-1) / jnp.asarray(self.reach, x.dtype) ** 2)
+
+    def _level_mask(self, x: Float[Array, "3"]) -> Float[Array, " levels"]:
+        """1 for levels heard at `x`, falling to 0 over the last two centimetres of a box."""
+        spacing = np.asarray(self.encoding.spacing)
+        mask = jnp.asarray(spacing >= self.trunk_spacing * 0.999, x.dtype)
+        for low, high, finest in zip(
+            self.detail_low, self.detail_high, self.detail_spacing, strict=True
+        ):  # a handful of boxes
+            depth = jnp.minimum(x - jnp.asarray(low), jnp.asarray(high) - x).min()
+            inside = jnp.clip(depth / 0.02, 0, 1)
+            mask = jnp.maximum(mask, inside * jnp.asarray(spacing >= finest * 0.999, x.dtype))
+        return mask
+
+
+def _joint_reach(
+    tree: KinematicTree, joints: Float[np.ndarray, "J 3"], least: float = 0.012, most: float = 0.15
+) -> tuple[float, ...]:
+    """Half the mean length of the bones that meet at each joint, metres, within bounds."""
+    lengths: list[list[float]] = [[] for _ in range(tree.num_joints)]
+    for joint, parent in enumerate(tree.parents):
+        if parent >= 0:
+            length = float(np.linalg.norm(joints[joint] - joints[parent]))
+            lengths[joint].append(length)
+            lengths[parent].append(length)
+    means = [np.mean(group) if group else most for group in lengths]
+    return tuple(float(np.clip(0.5 * mean, least, most)) for mean in means)
+
+
+def _triples(rows: Any) -> tuple[tuple[float, float, float], ...]:
+    return tuple((float(x), float(y), float(z)) for x, y, z in rows)

@@ -1,0 +1,264 @@
+"""Part grids: nodes near the body, coarse for the trunk, fine for hands and face.
+
+One coarse grid covers everything; each fine grid is a box aligned with coarse cells, so that a
+point is looked up in exactly one grid. At a fine box's border the values are those of the coarse
+grid's own interpolation, reached over a margin: the interpolated field is continuous everywhere.
+Cells near the body store their nodes; elsewhere a cell answers with the nearest stored one and
+`covers` is false.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)
+
+
+@dataclass(frozen=True)
+class GridSpacing:
+    """Node distances and band widths in metres; margins in cells of the coarse grid."""
+
+    body: float = 0.016
+    hands: float = 0.004
+    face: float = 0.008
+    band: float = 0.08
+    fine_band: float = 0.03
+    margin: float = 1.5
+
+
+class PartGrids(eqx.Module):
+    """Where the nodes are. Values live outside, one row a node.
+
+    Grid 0 is the coarse one. All grids share one array of nodes and one of cells; a cell lists
+    its eight nodes.
+    """
+
+    nodes: Float[Array, "N 3"]
+    cells: Int[Array, "C 8"]
+    covered: Bool[Array, " C"]
+    index: Int[Array, " dense"]
+    origin: Float[Array, "G 3"]
+    spacing: Float[Array, " G"]
+    shape: Int[Array, "G 3"]
+    offset: Int[Array, " G"]
+    blend_nodes: Int[Array, " B"]
+    blend_cells: Int[Array, "B 8"]
+    blend_lerp: Float[Array, "B 8"]
+    blend_share: Float[Array, " B"]
+
+    @property
+    def num_nodes(self) -> int:
+        return self.nodes.shape[0]
+
+    def locate(self, x: Float[Array, "*p 3"]) -> tuple[Array, Array, Array]:
+        """Cell of each point, the position in it (0 to 1 an axis inside), and its spacing."""
+        grid = jnp.zeros(x.shape[:-1], jnp.int32)
+        for g in range(1, self.origin.shape[0]):  # a handful of boxes, not joints
+            size = self.shape[g].astype(x.dtype) * self.spacing[g].astype(x.dtype)
+            local = x - self.origin[g].astype(x.dtype)
+            grid = jnp.where(jnp.all((local >= 0) & (local < size), axis=-1), g, grid)
+        spacing = self.spacing[grid].astype(x.dtype)
+        u = (x - self.origin[grid].astype(x.dtype)) / spacing[..., None]
+        shape = self.shape[grid]
+        cell = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
+        flat = (cell[..., 0] * shape[..., 1] + cell[..., 1]) * shape[..., 2] + cell[..., 2]
+        fraction = jnp.clip(u - cell, 0, 1)
+        return self.index[self.offset[grid] + flat], fraction, spacing
+
+    def covers(self, x: Float[Array, "*p 3"]) -> Bool[Array, "*p"]:
+        """Whether points lie in cells that store their nodes."""
+        cell, _, _ = self.locate(x)
+        low = self.origin[0]
+        high = low + self.shape[0] * self.spacing[0]
+        return self.covered[cell] & jnp.all((x >= low) & (x <= high), axis=-1)
+
+    def interpolate(
+        self, values: Float[Array, "N K"], x: Float[Array, "*p 3"]
+    ) -> Float[Array, "*p K"]:
+        """Trilinear interpolation of node values."""
+        cell, fraction, _ = self.locate(x)
+        return (lerp_weights(fraction)[..., None] * values[self.cells[cell]]).sum(-2)
+
+    def interpolate_with_gradient(
+        self, values: Float[Array, "N K"], x: Float[Array, "*p 3"]
+    ) -> tuple[Float[Array, "*p K"], Float[Array, "*p K 3"]]:
+        """Interpolated values and their exact derivative inside the cell, per metre."""
+        cell, fraction, spacing = self.locate(x)
+        corner = values[self.cells[cell]]
+        value = (lerp_weights(fraction)[..., None] * corner).sum(-2)
+        slopes = lerp_slopes(fraction) / spacing[..., None, None]  # (..., 8, 3)
+        return value, (slopes[..., None, :] * corner[..., None]).sum(-3)
+
+    def blend(self, values: Float[Array, "N K"]) -> Float[Array, "N K"]:
+        """Make values continuous across grids: fine nodes near a border follow the coarse grid."""
+        coarse = (self.blend_lerp[..., None] * values[self.blend_cells]).sum(1)
+        share = self.blend_share[:, None]
+        mixed = share * coarse + (1 - share) * values[self.blend_nodes]
+        return values.at[self.blend_nodes].set(mixed)
+
+
+def lerp_weights(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8"]:
+    """Weights of a cell's eight nodes at a position in it."""
+    f = fraction[..., None, :]
+    return jnp.where(_CORNERS == 1, f, 1 - f).prod(-1)
+
+
+def lerp_slopes(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8 3"]:
+    """Derivatives of `lerp_weights` with respect to the position in the cell."""
+    f = fraction[..., None, :]
+    factor = jnp.where(_CORNERS == 1, f, 1 - f)
+    sign = jnp.asarray(np.where(_CORNERS == 1, 1.0, -1.0), fraction.dtype)
+    yz, xz, xy = (
+        factor[..., 1] * factor[..., 2],
+        factor[..., 0] * factor[..., 2],
+        factor[..., 0] * factor[..., 1],
+    )
+    return jnp.stack([sign[:, 0] * yz, sign[:, 1] * xz, sign[:, 2] * xy], axis=-1)
+
+
+def build_part_grids(
+    vertices: Float[np.ndarray, "V 3"],
+    labels: Int[np.ndarray, " V"],
+    spacing: GridSpacing,
+    *,
+    fine_parts: dict[str, tuple[tuple[int, ...], float]],
+) -> PartGrids:
+    """Lay grids around canonical vertices (NumPy, at data time).
+
+    `fine_parts` maps a name to the part labels whose vertices its box encloses and its spacing,
+    which is rounded down to a whole fraction of the coarse one. A part without vertices gets no
+    grid.
+    """
+    coarse = spacing.body
+    low = np.floor((vertices.min(0) - 2 * spacing.band) / coarse) * coarse
+    shape = np.ceil((vertices.max(0) + 2 * spacing.band - low) / coarse).astype(int)
+    boxes = [(low, shape, coarse, spacing.band, vertices)]
+    for members, wanted in fine_parts.values():
+        own = vertices[np.isin(labels, members)]
+        if not len(own):
+            continue
+        ratio = int(np.ceil(coarse / wanted - 1e-9))
+        reach = spacing.fine_band
+        first = np.floor((own.min(0) - reach - low) / coarse)
+        last = np.ceil((own.max(0) + reach - low) / coarse)
+        near = vertices[
+            np.all(
+                (vertices > low + first * coarse - reach) & (vertices < low + last * coarse + reach),
+                axis=1,
+            )
+        ]
+        boxes.append(
+            (
+                low + first * coarse,
+                ((last - first) * ratio).astype(int),
+                coarse / ratio,
+                max(reach, spacing.fine_band),
+                near,
+            )
+        )
+    return _assemble(boxes, spacing)
+
+
+def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
+    from scipy.ndimage import distance_transform_edt
+
+    nodes, cells, covered, index, offsets = [], [], [], [], []
+    node_count = cell_count = dense_count = 0
+    for origin, shape, step, band, points in boxes:
+        near = _cells_near(origin, shape, step, band, points)
+        flat = np.flatnonzero(near.ravel())
+        ijk = np.stack(np.unravel_index(flat, near.shape), 1)
+        corner = ijk[:, None, :] + _CORNERS
+        stride = np.array([(shape[1] + 1) * (shape[2] + 1), shape[2] + 1, 1])
+        unique, inverse = np.unique(corner @ stride, return_inverse=True)
+        position = np.stack(np.unravel_index(unique, tuple(shape + 1)), 1)
+        nodes.append(origin + position * step)
+        cells.append(inverse.reshape(-1, 8) + node_count)
+        # A cell without nodes answers with the nearest cell that has some.
+        order = np.full(near.shape, -1)
+        order.ravel()[flat] = np.arange(len(flat))
+        nearest = distance_transform_edt(~near, return_distances=False, return_indices=True)
+        dense = order[tuple(nearest)].ravel() + cell_count
+        covered_here = np.ones(len(flat), bool)
+        # Those stand-ins are doubled, so that a cell knows whether it was asked for itself.
+        dense = np.where(near.ravel(), dense, dense + len(flat))
+        cells.append(cells[-1])
+        covered += [covered_here, ~covered_here]
+        index.append(dense)
+        offsets.append(dense_count)
+        node_count += len(unique)
+        cell_count += 2 * len(flat)
+        dense_count += near.size
+    all_nodes = np.concatenate(nodes)
+    grids = PartGrids(
+        nodes=jnp.asarray(all_nodes, jnp.float32),
+        cells=jnp.asarray(np.concatenate(cells), jnp.int32),
+        covered=jnp.asarray(np.concatenate(covered)),
+        index=jnp.asarray(np.concatenate(index), jnp.int32),
+        origin=jnp.asarray(np.stack([b[0] for b in boxes]), jnp.float32),
+        spacing=jnp.asarray([b[2] for b in boxes], jnp.float32),
+        shape=jnp.asarray(np.stack([b[1] for b in boxes]), jnp.int32),
+        offset=jnp.asarray(offsets, jnp.int32),
+        blend_nodes=jnp.zeros(0, jnp.int32),
+        blend_cells=jnp.zeros((0, 8), jnp.int32),
+        blend_lerp=jnp.zeros((0, 8), jnp.float32),
+        blend_share=jnp.zeros(0, jnp.float32),
+    )
+    return _with_margins(grids, boxes, [len(n) for n in nodes], spacing)
+
+
+def _cells_near(
+    origin: np.ndarray, shape: np.ndarray, step: float, band: float, points: np.ndarray
+) -> np.ndarray:
+    """Cells whose centre lies within `band` of a point."""
+    from scipy.ndimage import distance_transform_edt
+
+    occupied = np.zeros(tuple(shape), bool)
+    ijk = np.floor((points - origin) / step).astype(int)
+    inside = np.all((ijk >= 0) & (ijk < shape), axis=1)
+    occupied[tuple(ijk[inside].T)] = True
+    if not occupied.any():
+        raise ValueError("a part grid has no vertices inside its box")
+    return distance_transform_edt(~occupied) * step <= band + step
+
+
+def _with_margins(
+    grids: PartGrids, boxes: list, counts: list[int], spacing: GridSpacing
+) -> PartGrids:
+    """Fine nodes near their box's border, with their place in the coarse grid."""
+    first = np.cumsum([0, *counts])
+    picked, shares = [], []
+    for g in range(1, len(boxes)):
+        origin, shape, step, _, _ = boxes[g]
+        nodes = np.asarray(grids.nodes[first[g] : first[g + 1]], np.float64)
+        local = nodes - origin
+        depth = np.minimum(local, shape * step - local).min(1)
+        t = np.clip(depth / (spacing.margin * spacing.body), 0, 1)
+        share = 1 - t * t * (3 - 2 * t)
+        rows = np.flatnonzero(share > 0)
+        picked.append(rows + first[g])
+        shares.append(share[rows])
+    if not picked:
+        return grids
+    rows = np.concatenate(picked)
+    # Look the nodes up in the coarse grid alone.
+    origin, shape, step, _, _ = boxes[0]
+    u = (np.asarray(grids.nodes[rows], np.float64) - origin) / step
+    cell = np.clip(np.floor(u + 1e-6).astype(int), 0, shape - 1)
+    flat = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+    lerp = lerp_weights(jnp.asarray(np.clip(u - cell, 0, 1), jnp.float32))
+    return eqx.tree_at(
+        lambda t: (t.blend_nodes, t.blend_cells, t.blend_lerp, t.blend_share),
+        grids,
+        (
+            jnp.asarray(rows, jnp.int32),
+            grids.cells[grids.index[flat]],
+            lerp,
+            jnp.asarray(np.concatenate(shares), jnp.float32),
+        ),
+    )

@@ -1,0 +1,113 @@
+"""What the body's mean shape says of space: grids, weights on their nodes."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_vertices
+from ..geometry import closest_points
+from .grids import GridSpacing, PartGrids, build_part_grids
+from .hierarchical import hierarchical_logits, num_logits
+from .skinning import GridSkinning
+
+
+def mean_canonical_vertices(body: BodyModel) -> Float[np.ndarray, "V 3"]:
+    """The mean shape in the canonical pose, metres."""
+    return np.asarray(canonical_vertices(body, jnp.zeros(0, body.template.dtype)), np.float64)
+
+
+def body_part_grids(
+    body: BodyModel, vertices: Float[np.ndarray, "V 3"], spacing: GridSpacing
+) -> PartGrids:
+    """Grids around canonical vertices: coarse everywhere, fine at both hands and the face."""
+    return build_part_grids(
+        vertices,
+        np.asarray(body.part_labels),
+        spacing,
+        fine_parts={
+            "left_hand": ((LEFT_HAND,), spacing.hands),
+            "right_hand": ((RIGHT_HAND,), spacing.hands),
+            "face": (FACES, spacing.face),
+        },
+    )
+
+
+def template_weights(
+    body: BodyModel, vertices: Float[np.ndarray, "V 3"], points: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N J"]:
+    """The template's skinning weights, carried to points by the closest point of the surface.
+
+    `vertices` are the body's in the canonical pose, of any shape.
+    """
+    faces = np.asarray(body.faces)
+    _, face, position = closest_points(vertices, faces, points)
+    corners = vertices[faces[face]]
+    share = _barycentric(position, corners)
+    weights = np.asarray(body.weights, np.float64)
+    return np.einsum("nc,ncj->nj", share, weights[faces[face]])
+
+
+def template_grid_skinning(
+    body: BodyModel,
+    vertices: Float[np.ndarray, "V 3"],
+    spacing: GridSpacing,
+    correction_spacing: GridSpacing,
+    *,
+    smoothing_steps: int = 12,
+) -> GridSkinning:
+    """A body's own weights around its canonical `vertices` on part grids, without correction.
+
+    Away from the surface the weights are smoothed over neighbouring nodes, so that the field has
+    no jump where the closest point does (between fingers, between the legs).
+    """
+    grids = body_part_grids(body, vertices, spacing)
+    nodes = np.asarray(grids.nodes, np.float64)
+    weights = template_weights(body, vertices, nodes)
+    weights = _smooth_away_from_surface(vertices, grids, weights, smoothing_steps)
+    logits = hierarchical_logits(body.tree, weights)
+    correction_grids = body_part_grids(body, vertices, correction_spacing)
+    return GridSkinning(
+        template=grids.blend(jnp.asarray(logits, jnp.float32)),
+        correction=jnp.zeros((correction_grids.num_nodes, num_logits(body.tree)), jnp.float32),
+        grids=grids,
+        correction_grids=correction_grids,
+        tree=body.tree,
+    )
+
+
+def _smooth_away_from_surface(
+    vertices: np.ndarray, grids: PartGrids, weights: np.ndarray, steps: int
+) -> np.ndarray:
+    """Average with neighbours of the same grid; nodes of cells that the surface crosses stay."""
+    from scipy.sparse import coo_matrix
+
+    cells = np.unique(np.asarray(grids.cells), axis=0)
+    # The twelve edges of a cell: corners that differ in one bit.
+    edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+    rows = np.concatenate([cells[:, a] for a, b in edges] + [cells[:, b] for a, b in edges])
+    columns = np.concatenate([cells[:, b] for a, b in edges] + [cells[:, a] for a, b in edges])
+    links = coo_matrix((np.ones(len(rows), np.float32), (rows, columns)), (len(weights),) * 2)
+    links = links.tocsr()
+    links.data[:] = 1  # shared edges were counted once a cell
+    mean = links.multiply(1 / np.maximum(np.asarray(links.sum(1)), 1)).tocsr()
+    cell, _, _ = grids.locate(jnp.asarray(vertices, jnp.float32))
+    fixed = np.zeros(len(weights), bool)
+    fixed[np.asarray(grids.cells)[np.asarray(cell)].ravel()] = True
+    smooth = weights.astype(np.float32)
+    for _ in range(steps):
+        smooth = np.where(fixed[:, None], weights, mean @ smooth)
+    return smooth
+
+
+def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates of points on triangles `(N, 3, 3)`, clipped to the triangle."""
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d = points - corners[:, 0]
+    a, b, c = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
+    p, q = (d * e1).sum(1), (d * e2).sum(1)
+    det = np.maximum(a * c - b * b, 1e-30)
+    v, w = (c * p - b * q) / det, (a * q - b * p) / det
+    share = np.clip(np.stack([1 - v - w, v, w], 1), 0, 1)
+    return share / share.sum(1, keepdims=True)

@@ -1,0 +1,21 @@
+"""Where things are kept that are made once."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
+    """The folder for bodies, captures and pre-fitted fields: `override`, or the user's cache folder.
+
+    `XDG_CACHE_HOME` is honoured. The folder is made if it is missing.
+    """
+    if override is not None:
+        path = Path(override).expanduser()
+    else:
+        import platformdirs
+
+        path = Path(platformdirs.user_cache_dir("xavatar_jax", appauthor=False))
+    path.mkdir(parents=True, exist_ok=True)
+    return path

@@ -1,0 +1,163 @@
+"""Pickles and object arrays from strangers: data is read, code is refused.
+
+Body models and captures are published as pickles, some written with chumpy and Python 2. Reading
+them with `pickle.load` would run whatever the file says. Here only NumPy arrays, SciPy sparse
+matrices, built-in containers and chumpy's array wrapper (read as the array inside) are built.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy_format
+
+
+class UnsafePickleError(ValueError):
+    """A pickle asks for something other than plain data."""
+
+
+class _ChumpyArray:
+    """Stands in for `chumpy.ch.Ch` and its relatives: keeps the array, runs nothing of chumpy."""
+
+    def __init__(self, *args: Any) -> None:
+        self._state: Any = args[0] if args else None
+
+    def __setstate__(self, state: Any) -> None:
+        self._state = state
+
+    def array(self) -> np.ndarray:
+        state = self._state
+        if isinstance(state, dict):
+            for name in ("x", "a"):
+                if name in state:
+                    return _plain(state[name])
+        if isinstance(state, np.ndarray):
+            return state
+        raise UnsafePickleError(
+            "a chumpy object without a stored array: convert the file with chumpy installed, once, "
+            "or use the .npz release of the same model"
+        )
+
+
+_NUMPY_MODULES = ("numpy", "numpy.core", "numpy._core")
+_ALLOWED = {
+    ("builtins", name)
+    for name in (
+        *("dict", "list", "tuple", "set", "frozenset", "str", "bytes", "bytearray"),
+        *("int", "float", "complex", "bool", "slice", "range"),
+    )
+} | {("__builtin__", name) for name in ("dict", "list", "tuple", "set", "str", "int", "float", "bool")}
+_ALLOWED |= {("collections", "OrderedDict"), ("collections", "defaultdict"), ("_codecs", "encode")}
+_ALLOWED |= {("copyreg", "_reconstructor"), ("copy_reg", "_reconstructor"), ("builtins", "object")}
+_ALLOWED |= {("__builtin__", "object")}
+for _module in _NUMPY_MODULES:
+    _ALLOWED |= {
+        (_module, "ndarray"),
+        (_module, "dtype"),
+        (f"{_module}.multiarray", "_reconstruct"),
+        (f"{_module}.multiarray", "scalar"),
+        (f"{_module}.numeric", "_frombuffer"),
+    }
+_ALLOWED |= {("numpy.dtypes", name) for name in dir(np.dtypes) if name.endswith("DType")}
+_SPARSE = {"csc_matrix", "csr_matrix", "coo_matrix", "csc_array", "csr_array", "coo_array"}
+
+
+class _RestrictedUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _ALLOWED:
+            return super().find_class(module.replace("numpy.core", "numpy._core"), name)
+        if module.startswith("scipy.sparse") and name in _SPARSE:
+            return super().find_class("scipy.sparse", name)
+        if module.split(".")[0] == "chumpy" and name in ("Ch", "Select", "MatVecMult", "Add"):
+            return _ChumpyArray
+        raise UnsafePickleError(
+            f"the pickle asks for {module}.{name}, which is not plain data, so it was not read. "
+            "Only NumPy arrays, SciPy sparse matrices and built-in containers are accepted."
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Containers with chumpy's wrappers replaced by the arrays inside."""
+    if isinstance(value, _ChumpyArray):
+        return value.array()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_plain(item) for item in value)
+    return value
+
+
+def _unpickle(file: BinaryIO) -> Any:
+    # latin1 reads the byte strings of arrays that Python 2 pickled.
+    return _plain(_RestrictedUnpickler(file, encoding="latin1").load())
+
+
+def load_pickle(path: str | os.PathLike[str]) -> Any:
+    """Read a pickle of plain data; chumpy arrays come back as NumPy arrays.
+
+    **Raises:** `UnsafePickleError` if the file asks for anything but data, `ValueError` naming the
+    file if it is damaged, `FileNotFoundError`.
+    """
+    try:
+        with open(path, "rb") as file:
+            return _unpickle(file)
+    except UnsafePickleError as error:
+        raise UnsafePickleError(f"{os.fspath(path)}: {error}") from None
+    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError) as error:
+        raise ValueError(f"{os.fspath(path)}: not a readable pickle ({error})") from error
+
+
+def _read_npy(file: BinaryIO) -> Any:
+    version = npy_format.read_magic(file)
+    # Read the header once to learn whether the payload is a pickle, then hand over.
+    if version == (1, 0):
+        shape, fortran, dtype = npy_format.read_array_header_1_0(file)
+    elif version == (2, 0):
+        shape, fortran, dtype = npy_format.read_array_header_2_0(file)
+    else:
+        raise ValueError(f"npy format version {version} is not supported")
+    if dtype.hasobject:
+        return _unpickle(file)
+    count = int(np.prod(shape, dtype=np.int64))
+    data = np.frombuffer(file.read(count * dtype.itemsize), dtype=dtype, count=count)
+    return data.reshape(shape[::-1]).T.copy() if fortran else data.reshape(shape).copy()
+
+
+def load_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read every array of an `.npz`; object arrays are unpickled under restriction.
+
+    A zero-dimensional object array comes back as the object inside (a dict, most often).
+
+    **Raises:** `UnsafePickleError`, `ValueError` naming the file and the entry, `FileNotFoundError`.
+    """
+    entries: dict[str, Any] = {}
+    name = ""
+    try:
+        with zipfile.ZipFile(Path(path)) as archive:
+            for name in archive.namelist():
+                data = _read_npy(io.BytesIO(archive.read(name)))
+                if isinstance(data, np.ndarray) and data.dtype.hasobject and data.shape == ():
+                    data = _plain(data.item())
+                entries[name.removesuffix(".npy")] = data
+    except UnsafePickleError as error:
+        raise UnsafePickleError(f"{os.fspath(path)}, entry {name!r}: {error}") from None
+    except FileNotFoundError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise ValueError(
+            f"{os.fspath(path)}: not a readable .npz archive (entry {name!r}: {error})"
+        ) from error
+    return entries
+
+
+
+
+
+

@@ -1,0 +1,109 @@
+"""Evaluation of a field in batches of one fixed size, so that a jitted field never retraces."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+ScalarField = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
+VectorField = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N 3"]]
+
+
+class EmptyLevelSetError(ValueError):
+    """The field has no surface at the level asked for, within the bounds asked for."""
+
+
+class FieldSampler:
+    """Calls a field on float32 batches of exactly `batch_points` rows, padding the last.
+
+    Values are relative to `level`; outside `bounds` the sampler answers "outside" by itself, so
+    that every surface is closed at the bounds. It keeps the range of values and a count.
+    """
+
+    def __init__(
+        self,
+        field: ScalarField,
+        bounds: Float[np.ndarray, "2 3"],
+        *,
+        level: float,
+        batch_points: int,
+        gradient: VectorField | None = None,
+        verbose: bool = False,
+    ) -> None:
+        if batch_points < 1:
+            raise ValueError(f"batch_points must be 1 or more, found {batch_points}.")
+        self.bounds = bounds
+        self.lowest, self.highest, self.count = np.inf, -np.inf, 0
+        self.has_gradient = gradient is not None
+        self._field, self._gradient = field, gradient
+        self._level, self._batch = level, batch_points
+        self._bar = None
+        if verbose:
+            from tqdm.auto import tqdm
+
+            self._bar = tqdm(desc="meshing", unit="points", unit_scale=True, disable=None)
+
+    def close(self) -> None:
+        """End the progress bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+        """Field minus level, float64, never exactly zero; negative outside the bounds."""
+        within = self.within(points)
+        every = bool(within.all())
+        raw = self._run(self._field, points if every else points[within], ())
+        values = raw.astype(np.float64) - self._level
+        if len(values):
+            self.lowest = min(self.lowest, float(values.min()))
+            self.highest = max(self.highest, float(values.max()))
+        # An exact zero has no side. Outside it is, by the smallest amount that still divides.
+        values[values == 0] = -np.finfo(np.float32).tiny
+        if every:
+            return values
+        result = np.full(len(points), -1.0)
+        result[within] = values
+        return result
+
+    def within(self, points: Float[np.ndarray, "N 3"]) -> np.ndarray:
+        """Whether each point lies in the bounds, (N,) bool."""
+        return np.all((points >= self.bounds[0]) & (points <= self.bounds[1]), axis=1)
+
+    def gradient(
+        self, points: Float[np.ndarray, "N 3"], step: Float[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "N 3"]:
+        """Gradient by the callable given, else by differences over `step` (N,), metres."""
+        if self._gradient is not None:
+            return self._run(self._gradient, points, (3,)).astype(np.float64)
+        # Four corners of a tetrahedron: a second-order gradient for four evaluations.
+        corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
+        probes = points[:, None] + step[:, None, None] * corners
+        values = self._run(self._field, probes.reshape(-1, 3), ()).astype(np.float64)
+        return values.reshape(-1, 4) @ corners / (4.0 * step[:, None])
+
+    def _run(self, function: Callable, points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Call `function` batch by batch and check what it answers."""
+        results = np.empty((len(points), *shape), dtype=np.float32)
+        for start in range(0, len(points), self._batch):
+            part = np.asarray(points[start : start + self._batch], dtype=np.float32)
+            rows = len(part)
+            if rows < self._batch:
+                part = np.concatenate([part, np.repeat(part[:1], self._batch - rows, axis=0)])
+            answer = np.asarray(function(part))
+            if answer.shape != (self._batch, *shape):
+                raise ValueError(
+                    f"the {'gradient' if shape else 'field'} must answer points of shape "
+                    f"({self._batch}, 3) with shape {(self._batch, *shape)}, found {answer.shape}."
+                )
+            results[start : start + rows] = answer[:rows]
+            self.count += rows
+            if self._bar is not None:
+                self._bar.update(rows)
+        bad = ~np.isfinite(results).all(axis=tuple(range(1, results.ndim)))
+        if bad.any():
+            first = np.asarray(points)[bad][0]
+            raise ValueError(
+                f"the field is not finite at {int(bad.sum())} of {len(points)} points, first at "
+                f"{first.tolist()}: check the weights that it was made from."
+            )
+        return results

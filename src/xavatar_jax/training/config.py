@@ -1,0 +1,195 @@
+"""What a run is made of, as plain frozen dataclasses; presets are values of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any, Literal, get_type_hints
+
+from ..correspondence import StartSet
+from ..fields import PAPER_SKINNING, GridSpacing, MLPShape
+from ..sampling import SamplingPlan
+
+
+@dataclass(frozen=True)
+class SkinningConfig:
+    """`grid`: template weights on part grids with a learned correction; `mlp`: the paper's."""
+
+    kind: Literal["grid", "mlp"] = "grid"
+    grid: GridSpacing = GridSpacing()
+    correction: GridSpacing = GridSpacing(body=0.048, hands=0.012, face=0.024)
+    mlp: MLPShape = PAPER_SKINNING
+    learned: bool = True
+
+
+@dataclass(frozen=True)
+class GeometryConfig:
+    """`hash`: feature grids and a small MLP; `mlp`: the paper's network.
+
+    `spacing` is the node distance of each level in metres; levels finer than `trunk` are heard
+    at hands (down to `hands`) and face (down to `face`) only.
+    """
+
+    kind: Literal["hash", "mlp"] = "hash"
+    spacing: tuple[float, ...] = (0.12, 0.07, 0.042, 0.025, 0.015, 0.009, 0.0055, 0.0034)
+    trunk: float = 0.009
+    hands: float = 0.0034
+    face: float = 0.0055
+    features: int = 2
+    log2_size: int = 17
+    width: int = 64
+    condition: int = 16
+    sharpness: float = 10.0
+    box_margin: float = 0.25
+    mlp: MLPShape = MLPShape()
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """Where roots come from.
+
+    - `starts`: which bones start a point's search.
+    - `cached`: search once on the tabulated field when points are drawn, and polish the roots by
+      a Newton step whenever they are used; else search inside every training step.
+    - `grid`: the grids of the tabulated search; `keep`: roots kept a point; `atol`: metres.
+    """
+
+    starts: StartSet = "part_aware"
+    cached: bool = True
+    grid: GridSpacing = GridSpacing()
+    keep: int = 3
+    atol: float = 1e-5
+    max_steps: int = 15
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms, and the width of the occupancy step in metres (0: hard labels).
+
+    `surface_parts` says which canonical vertices of the body hold the skinning to the template's:
+    those of hands and face, as the released code does, or all. `surface_points` is how many are
+    drawn a step (0: all of them).
+    """
+
+    softness: float = 0.004
+    bone: float = 1.0
+    joint: float = 10.0
+    surface: float = 10.0
+    surface_parts: Literal["hands_face", "all"] = "hands_face"
+    surface_points: int = 0
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """Adam with a global-norm clip; `cosine` falls to a hundredth of the rate at the last step."""
+
+    learning_rate: float = 1e-3
+    skinning_rate: float = 1e-3
+    schedule: Literal["constant", "cosine"] = "constant"
+    clip: float = 0.1
+    epsilon: float = 1e-8
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Everything that decides a run.
+
+    - `steps`, `minutes`: whichever ends first; `minutes` counts from the call of `fit`.
+    - `train_frames`: frames drawn for their variety (0: all).
+    - `points`: how many points a frame gives, and where.
+    - `frames_per_step`, `points_per_step` (of each frame).
+    - `skinning_every`, `skinning_points`: with stored roots, every so many steps the skinning
+      field is updated from so many points a frame; the other steps update the geometry.
+    - `polish_every`: steps after which stored roots follow the skinning field.
+    - `prefit_steps`: steps that fit the geometry to the body's mean shape first, cached.
+    """
+
+    preset: str = "quick"
+    seed: int = 0
+    steps: int = 1500
+    minutes: float | None = None
+    train_frames: int = 200
+    frames_per_step: int = 16
+    points_per_step: int = 512
+    skinning_every: int = 4
+    skinning_points: int = 128
+    polish_every: int = 400
+    prefit_steps: int = 300
+    points: SamplingPlan = SamplingPlan()
+    skinning: SkinningConfig = SkinningConfig()
+    geometry: GeometryConfig = GeometryConfig()
+    search: SearchConfig = SearchConfig()
+    losses: LossConfig = LossConfig()
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+
+
+def quick() -> FitConfig:
+    """Minutes on two CPU cores: grid-encoded fields, roots found when points are drawn."""
+    return FitConfig(
+        points=SamplingPlan(
+            body=2600,
+            face=700,
+            eyes_mouth=500,
+            hand=1000,
+            box=200,
+            sigma=(0.003, 0.012),
+            fine_sigma=(0.002, 0.008),
+            by_vertex=False,
+        ),
+        losses=LossConfig(
+            softness=0.004, joint=0.1, surface=100.0, surface_parts="all", surface_points=2048
+        ),
+        optimiser=OptimiserConfig(
+            learning_rate=5e-3, skinning_rate=2e-2, schedule="cosine", clip=1.0, epsilon=1e-15
+        ),
+    )
+
+
+def paper() -> FitConfig:
+    """The paper's networks, losses, counts and schedule (released code where they differ)."""
+    return FitConfig(
+        preset="paper",
+        steps=45_000,
+        train_frames=0,
+        frames_per_step=4,
+        points_per_step=6000,
+        prefit_steps=2000,
+        points=SamplingPlan(),
+        skinning=SkinningConfig(kind="mlp"),
+        geometry=GeometryConfig(kind="mlp"),
+        search=SearchConfig(cached=False, keep=16, max_steps=50),
+        losses=LossConfig(softness=0.0),
+        optimiser=OptimiserConfig(),
+    )
+
+
+PRESETS = {"quick": quick, "paper": paper}
+
+
+def config_to_dict(config: FitConfig) -> dict[str, Any]:
+    """The config as plain values for JSON."""
+    return asdict(config)
+
+
+def config_from_dict(values: Mapping[str, Any]) -> FitConfig:
+    """The config that `config_to_dict` gave, after a trip through JSON.
+
+    **Raises:** `ValueError` naming an entry that this version does not know.
+    """
+    return _build(FitConfig, values, "config")
+
+
+def _build(kind: Any, values: Mapping[str, Any], where: str) -> Any:
+    known = {f.name: f for f in fields(kind)}
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise ValueError(f"{where}: unknown entry {unknown[0]!r}; it may come from a newer version")
+    hints = get_type_hints(kind)
+    built = {}
+    for name, value in values.items():
+        if is_dataclass(hints[name]):
+            value = _build(hints[name], value, f"{where}.{name}")
+        elif isinstance(value, list):
+            value = tuple(value)
+        built[name] = value
+    return kind(**built)

@@ -1,0 +1,131 @@
+"""The fields of one avatar, and which of their arrays are learned."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_joints, canonical_vertices
+from ..fields import (
+    AbstractGeometryField,
+    AbstractSkinningField,
+    GridSkinning,
+    HashGeometry,
+    MLPGeometry,
+    MLPSkinning,
+    mean_canonical_vertices,
+    template_grid_skinning,
+)
+from .config import FitConfig, GeometryConfig, SkinningConfig
+
+
+# Metres around the mean shape's hands and face where detail is heard: another person's hands are
+# some centimetres away.
+_DETAIL_MARGIN = 0.1
+
+
+class AvatarFields(eqx.Module):
+    """Skinning and geometry in one canonical space."""
+
+    skinning: AbstractSkinningField
+    geometry: AbstractGeometryField
+
+
+def fresh_fields(body: BodyModel, config: FitConfig) -> AvatarFields:
+    """Fields before anything was fitted: a function of body, config and seed."""
+    key_skinning, key_geometry = jax.random.split(jax.random.key(config.seed))
+    return AvatarFields(
+        skinning=_skinning(body, config.skinning, key_skinning),
+        geometry=_geometry(body, config.geometry, key_geometry),
+    )
+
+
+def _skinning(body: BodyModel, config: SkinningConfig, key: Array) -> AbstractSkinningField:
+    if config.kind == "mlp":
+        return MLPSkinning(body.tree, config.mlp, key=key)
+    return template_grid_skinning(
+        body, mean_canonical_vertices(body), config.grid, config.correction
+    )
+
+
+def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGeometryField:
+    expression = min(body.num_expression, 10)
+    if config.kind == "mlp":
+        return MLPGeometry(body.tree, expression, config.mlp, key=key)
+    vertices = mean_canonical_vertices(body)
+    labels = np.asarray(body.part_labels)
+    detail = []
+    for members, spacing in (
+        ((LEFT_HAND,), config.hands),
+        ((RIGHT_HAND,), config.hands),
+        (FACES, config.face),
+    ):
+        own = vertices[np.isin(labels, members)]
+        if len(own):
+            detail.append((own.min(0) - _DETAIL_MARGIN, own.max(0) + _DETAIL_MARGIN, spacing))
+    return HashGeometry(
+        body.tree,
+        np.asarray(canonical_joints(body, jnp.zeros(0, body.template.dtype))),
+        expression,
+        vertices.min(0) - config.box_margin,
+        vertices.max(0) + config.box_margin,
+        spacing=config.spacing,
+        trunk_spacing=config.trunk,
+        detail=tuple(detail),
+        features=config.features,
+        log2_size=config.log2_size,
+        width=config.width,
+        condition_width=config.condition,
+        sharpness=config.sharpness,
+        key=key,
+    )
+
+
+def settle_on_person(
+    body: BodyModel, fields: AvatarFields, betas: Float[np.ndarray, " S"], config: FitConfig
+) -> AvatarFields:
+    """Lay grid fields around the person's own canonical body: the first act of training.
+
+    The surface term of the objective asks for the template's weights at the person's canonical
+    vertices (X-Avatar, section 3.4, which takes the subject's mean shape there). On grids that
+    has a direct solution, which gradient descent from the mean shape would take long to find
+    where a hand lies some centimetres away. Networks come back as they are.
+    """
+    betas = jnp.asarray(betas, body.template.dtype)
+    if isinstance(fields.skinning, GridSkinning):
+        vertices = np.asarray(canonical_vertices(body, betas), np.float64)
+        grid = template_grid_skinning(
+            body, vertices, config.skinning.grid, config.skinning.correction
+        )
+        fields = eqx.tree_at(lambda f: f.skinning, fields, grid)
+    if isinstance(fields.geometry, HashGeometry):
+        joints = jnp.asarray(canonical_joints(body, betas), jnp.float32)
+        fields = eqx.tree_at(lambda f: f.geometry.joints, fields, joints)
+    return fields
+
+
+def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
+    """A tree of booleans: which leaves are learned. Template arrays and grids never are."""
+    learned = jax.tree.map(eqx.is_inexact_array, fields)
+    if isinstance(fields.skinning, GridSkinning):
+        frozen = jax.tree.map(lambda _: False, fields.skinning)
+        frozen = eqx.tree_at(lambda s: s.correction, frozen, config.skinning.learned)
+        learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
+    elif not config.skinning.learned:
+        frozen = jax.tree.map(lambda _: False, fields.skinning)
+        learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
+    if isinstance(fields.geometry, HashGeometry):
+        learned = eqx.tree_at(lambda f: f.geometry.joints, learned, False)
+    return learned
+
+
+def as_dtype(fields: AvatarFields, dtype: Any) -> AvatarFields:
+    """The same fields with floating-point leaves of another type."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, fields
+    )

@@ -1,0 +1,203 @@
+"""Labelled points of many frames, with the roots that were found for them."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..body import BodyModel, BodyParams, bone_transforms
+from ..correspondence import ClosedFormNewton, search_grid, start_table
+from ..fields import (
+    AbstractSkinningField,
+    GridSkinning,
+    TabulatedSkinning,
+    body_part_grids,
+    mean_canonical_vertices,
+    pose_grid,
+    tabulate,
+)
+from ..kinematics import inverse_3x3, skin_points
+from ..frames import Frame, Frames, nearest_part_labels
+from ..sampling import sample_frame
+from .config import FitConfig
+
+
+class FramePool(eqx.Module):
+    """Points of F frames, N each, in rows: those with several roots first, those without last.
+
+    Translation is removed from points and transforms.
+
+    - `points`: `(F, N, 3)`; `parts`: `(F, N)`; `distance`: `(F, N)`, positive inside.
+    - `root`: `(F, N, 3)` the first root; `others`: `(F, Q, K - 1, 3)` further ones of the first Q
+      rows, with `others_valid`.
+    - `found`, `several`: `(F,)` rows that have a root, and more than one.
+    - `transforms`: `(F, J, 4, 4)`; `params`: batched over F.
+    """
+
+    points: Float[Array, "F N 3"]
+    parts: Int[Array, "F N"]
+    distance: Float[Array, "F N"]
+    root: Float[Array, "F N 3"]
+    others: Float[Array, "F Q K 3"]
+    others_valid: Bool[Array, "F Q K"]
+    found: Int[Array, " F"]
+    several: Int[Array, " F"]
+    transforms: Float[Array, "F J 4 4"]
+    params: BodyParams
+
+
+def centred(params: BodyParams) -> BodyParams:
+    """The same parameters without translation."""
+    return eqx.tree_at(lambda p: p.transl, params, jnp.zeros_like(params.transl))
+
+
+def frame_labels(body: BodyModel, frame: Frame) -> Int[np.ndarray, " V"]:
+    """A frame's own part labels, or those of the nearest vertices of the posed body."""
+    if frame.part_labels is not None:
+        return frame.part_labels
+    return nearest_part_labels(body, frame.params, frame.vertices)
+
+
+def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: object) -> FramePool:
+    """Draw and label the points of every frame. Roots come later.
+
+    Draws are keyed by seed and frame: the same frame gets the same points in any order.
+    """
+    points, parts, distance = [], [], []
+    for k in range(len(frames)):
+        frame = frames[k]
+        rng = np.random.default_rng((config.seed, k))
+        samples = sample_frame(frame, frame_labels(body, frame), config.points, rng)
+        shift = np.asarray(frame.params.transl, np.float32)
+        points.append(samples.points - shift)
+        parts.append(samples.parts.astype(np.int8))
+        distance.append(samples.distance)
+        bar.update(1)  # type: ignore[attr-defined]
+    params = centred(frames.params)
+    transforms = eqx.filter_jit(jax.vmap(lambda p: bone_transforms(body, p)))(params)
+    shape = (len(points), len(points[0]))
+    return FramePool(
+        points=jnp.asarray(np.stack(points)),
+        parts=jnp.asarray(np.stack(parts)),
+        distance=jnp.asarray(np.stack(distance)),
+        root=jnp.zeros((*shape, 3)),
+        others=jnp.zeros((len(points), 1, 0, 3)),
+        others_valid=jnp.zeros((len(points), 1, 0), bool),
+        found=jnp.full(len(points), shape[1], jnp.int32),
+        several=jnp.zeros(len(points), jnp.int32),
+        transforms=jnp.asarray(transforms, jnp.float32),
+        params=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params),
+    )
+
+
+def tabulate_for_search(
+    body: BodyModel, skinning: AbstractSkinningField, config: FitConfig
+) -> TabulatedSkinning:
+    """The field on the search's grids; a grid field is tabulated on its own."""
+    if isinstance(skinning, GridSkinning):
+        grids = skinning.grids
+    else:
+        grids = body_part_grids(body, mean_canonical_vertices(body), config.search.grid)
+    return eqx.filter_jit(tabulate)(skinning, grids)
+
+
+def find_roots(
+    body: BodyModel,
+    skinning: AbstractSkinningField,
+    pool: FramePool,
+    config: FitConfig,
+    *,
+    bar: object,
+) -> FramePool:
+    """Search every point of the pool on the tabulated field, frame by frame."""
+    table = tabulate_for_search(body, skinning, config)
+    bones, mask = (jnp.asarray(v) for v in start_table(body.tree, config.search.starts))
+    solver = ClosedFormNewton(atol=config.search.atol, divergence=1.0)
+
+    @eqx.filter_jit
+    def search(table: TabulatedSkinning, x: Array, parts: Array, transforms: Array):
+        found = search_grid(
+            pose_grid(table, transforms),
+            x,
+            parts,
+            transforms,
+            bones,
+            mask,
+            solver=solver,
+            keep=config.search.keep,
+            max_steps=config.search.max_steps,
+        )
+        return found.x_c, found.valid
+
+    rows = []
+    for k in range(pool.points.shape[0]):
+        x_c, valid = search(table, pool.points[k], pool.parts[k], pool.transforms[k])
+        rows.append((np.asarray(x_c), np.asarray(valid)))
+        bar.update(1)  # type: ignore[attr-defined]
+    return _ordered(pool, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
+
+
+def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool:
+    """Rows by their number of roots; valid roots come first in a row already."""
+    count = valid.sum(-1)
+    order = np.argsort(-count, axis=1, kind="stable")
+    several = (count > 1).sum(1)
+    width = max(int(several.max()), 1)
+
+    def sort(leaf: Array) -> np.ndarray:
+        leaf = np.asarray(leaf)
+        index = order.reshape(*order.shape, *(1,) * (leaf.ndim - 2))
+        return np.take_along_axis(leaf, index, axis=1)
+
+    roots, valid = sort(roots), sort(valid)
+    return FramePool(
+        points=jnp.asarray(sort(pool.points)),
+        parts=jnp.asarray(sort(pool.parts)),
+        distance=jnp.asarray(sort(pool.distance)),
+        root=jnp.asarray(roots[:, :, 0]),
+        others=jnp.asarray(roots[:, :width, 1:]),
+        others_valid=jnp.asarray(valid[:, :width, 1:]),
+        found=jnp.asarray((count > 0).sum(1), jnp.int32),
+        several=jnp.asarray(several, jnp.int32),
+        transforms=pool.transforms,
+        params=pool.params,
+    )
+
+
+def polish_roots(
+    skinning: AbstractSkinningField, table: TabulatedSkinning, pool: FramePool, *, steps: int = 2
+) -> FramePool:
+    """Move every stored root to where the field has it now, by Newton steps.
+
+    Residuals are the field's own; Jacobians are the table's, which are close and cost a lookup.
+    """
+
+    @eqx.filter_jit
+    def polish(field: AbstractSkinningField, table: TabulatedSkinning, frames: tuple) -> tuple:
+        def one_frame(frame: tuple) -> tuple:
+            points, root, others, transforms = frame
+            grid = pose_grid(table, transforms)
+
+            def newton(x: Array, target: Array) -> Array:
+                _, jacobian = grid(x)
+                off = skin_points(x, field(x), transforms) - target
+                step = (inverse_3x3(jacobian) * off).sum(-1)
+                # A root that has to go further than this was not this root.
+                ok = jnp.sum(step**2) < 0.02**2
+                return jnp.where(ok, x - step, x)
+
+            targets = jnp.broadcast_to(points[: others.shape[0], None], others.shape)
+            for _ in range(steps):
+                root = jax.vmap(newton)(root, points)
+                others = jax.vmap(jax.vmap(newton))(others, targets)
+            return root, others
+
+        return jax.lax.map(one_frame, frames)
+
+    root, others = polish(
+        skinning, table, (pool.points, pool.root, pool.others, pool.transforms)
+    )
+    return eqx.tree_at(lambda p: (p.root, p.others), pool, (root, others))

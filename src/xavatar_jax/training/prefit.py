@@ -1,0 +1,145 @@
+"""First fields from the body's mean shape: no download, nothing of the person to be learned."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array
+
+from .._version import __version__
+from ..body import FACES, HANDS, BodyModel, BodyParams
+from ..fields import mean_canonical_vertices, template_weights
+from ..files import cache_dir, flatten_named, load_arrays, save_arrays, unflatten_named
+from ..geometry import face_areas
+from ..losses import binary_cross_entropy, soft_occupancy, squared_error
+from ..sampling import signed_distance
+from .config import FitConfig
+from .model import AvatarFields, fresh_fields, trainable_filter
+from .progress import progress
+
+_POINTS = 400_000
+_BATCH = 8192
+
+
+def initial_fields(
+    body: BodyModel,
+    config: FitConfig,
+    *,
+    cache: str | os.PathLike[str] | None = None,
+    verbose: bool = True,
+) -> AvatarFields:
+    """Fields fitted to the mean shape of the body; kept in the cache folder, one a body and config.
+
+    The person's betas, correctives and frames play no part in it.
+    """
+    fields = fresh_fields(body, config)
+    fingerprint = json.dumps(
+        [
+            __version__,
+            body.source.checksum,
+            asdict(config.skinning),
+            asdict(config.geometry),
+            config.prefit_steps,
+            config.losses.softness,
+            config.seed,
+        ]
+    )
+    name = hashlib.sha256(fingerprint.encode()).hexdigest()[:16]
+    path = cache_dir(cache) / f"prefit-{config.preset}-{name}.npz"
+    # The template's grids are made anew: only what the fit changes is kept.
+    arrays = eqx.filter(fields, _prefit_filter(fields, config))
+    if path.exists():
+        saved, _ = load_arrays(path)
+        return eqx.combine(unflatten_named(arrays, saved, source=str(path)), fields)
+    fields = _fit_mean_shape(body, fields, config, verbose=verbose)
+    kept = eqx.filter(fields, _prefit_filter(fields, config))
+    save_arrays(path, flatten_named(kept), {"kind": "prefit"})
+    return fields
+
+
+def _fit_mean_shape(
+    body: BodyModel, fields: AvatarFields, config: FitConfig, *, verbose: bool
+) -> AvatarFields:
+    points, distance, weights = _mean_shape_points(body, config)
+    params = BodyParams.zeros(body)
+    learned, fixed = eqx.partition(fields, _prefit_filter(fields, config))
+    rate = optax.cosine_decay_schedule(
+        config.optimiser.learning_rate, max(config.prefit_steps, 1), alpha=0.05
+    )
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(config.optimiser.clip),
+        optax.adam(rate, eps=config.optimiser.epsilon),
+    )
+    fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
+
+    @eqx.filter_jit
+    def step(learned: Any, state: Any, k: Array, data: Any, fixed_arrays: Any) -> Any:
+        points, distance, weights = data
+        key = jax.random.fold_in(jax.random.key(config.seed), k)
+        rows = jax.random.randint(key, (_BATCH,), 0, len(points))
+
+        def loss(learned: AvatarFields) -> Array:
+            fields = eqx.combine(learned, fixed_arrays, static)
+            condition = fields.geometry.condition(params)
+            logit = jax.vmap(lambda x: fields.geometry(x, condition))(points[rows])
+            target = soft_occupancy(distance[rows], config.losses.softness)
+            total = binary_cross_entropy(logit, target).mean()
+            if weights is not None:
+                found = jax.vmap(fields.skinning)(points[rows])
+                total = total + 100 * squared_error(found, weights[rows]).mean()
+            return total
+
+        value, gradient = jax.value_and_grad(loss)(learned)
+        updates, state = optimiser.update(gradient, state, learned)
+        return eqx.apply_updates(learned, updates), state, value
+
+    state = optimiser.init(eqx.filter(learned, eqx.is_inexact_array))
+    data = (points, distance, weights)
+    with progress("mean shape", config.prefit_steps, verbose=verbose) as bar:
+        for k in range(config.prefit_steps):
+            learned, state, value = step(learned, state, jnp.asarray(k), data, fixed_arrays)
+            if k % 25 == 0:
+                bar.set_postfix(loss=f"{float(value):.4f}")
+            bar.update(1)
+    return eqx.combine(learned, fixed)
+
+
+def _prefit_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
+    """Geometry always; skinning where it is a network (a grid already holds the template)."""
+    learned = trainable_filter(fields, config)
+    if config.skinning.kind == "grid":
+        frozen = jax.tree.map(lambda _: False, fields.skinning)
+        learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
+    return learned
+
+
+def _mean_shape_points(body: BodyModel, config: FitConfig) -> tuple[Array, Array, Array | None]:
+    """Points around the mean shape, signed distances, and template weights for a network."""
+    rng = np.random.default_rng(config.seed)
+    vertices, faces = mean_canonical_vertices(body), np.asarray(body.faces)
+    labels = np.asarray(body.part_labels)[faces[:, 0]]
+    density = face_areas(vertices, faces)
+    # Small parts get more than their area's share.
+    density[np.isin(labels, HANDS)] *= 8
+    density[np.isin(labels, FACES)] *= 5
+    face = rng.choice(len(faces), _POINTS, p=density / density.sum())
+    share = rng.dirichlet(np.ones(3), _POINTS)
+    points = np.einsum("nc,ncd->nd", share, vertices[faces[face]])
+    sigma = np.resize([0.003, 0.01, 0.03], _POINTS)[:, None]
+    points += sigma * rng.standard_normal(points.shape)
+    far = rng.uniform(vertices.min(0) - 0.2, vertices.max(0) + 0.2, (_POINTS // 20, 3))
+    points = np.concatenate([points, far])
+    distance = signed_distance(vertices, faces, points)
+    weights = None
+    if config.skinning.kind != "grid":
+        weights = jnp.asarray(template_weights(body, vertices, points), jnp.float32)
+    return jnp.asarray(points, jnp.float32), jnp.asarray(distance, jnp.float32), weights

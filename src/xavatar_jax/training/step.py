@@ -1,0 +1,175 @@
+"""One step of training, jitted: draw a batch, differentiate, update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from .config import FitConfig
+from .model import AvatarFields, trainable_filter
+from .objective import Anchors, Batch, full_objective, geometry_objective, skinning_objective
+from .pool import FramePool
+
+
+class TrainState(eqx.Module):
+    """What a step changes: learned leaves, an optimiser state for each field, steps done."""
+
+    learned: AvatarFields
+    optimisers: dict[str, Any]
+    step: Int[Array, ""]
+
+
+Step = Callable[[TrainState, FramePool], tuple[TrainState, dict[str, Array]]]
+
+
+def make_optimiser(config: FitConfig, rate: float, steps: int) -> optax.GradientTransformation:
+    """Adam after a global-norm clip."""
+    options = config.optimiser
+    schedule: Any = rate
+    if options.schedule == "cosine":
+        schedule = optax.cosine_decay_schedule(rate, max(steps, 1), alpha=0.01)
+    return optax.chain(
+        optax.clip_by_global_norm(options.clip), optax.adam(schedule, eps=options.epsilon)
+    )
+
+
+def draw_batch(
+    pool: FramePool, config: FitConfig, points: int, several: int, key: PRNGKeyArray
+) -> Batch:
+    """Random frames and `points` random points of each, `several` from those with many roots."""
+    frame_key, several_key, single_key = jax.random.split(key, 3)
+    chosen = jax.random.randint(frame_key, (config.frames_per_step,), 0, pool.points.shape[0])
+    # A frame without points of several roots gives its first ones, which have none but one.
+    first = jnp.minimum(pool.several[chosen], pool.others.shape[1])
+    rows = jnp.concatenate(
+        [
+            _uniform_index(several_key, several, 0 * first, jnp.maximum(first, 1)),
+            _uniform_index(single_key, points - several, first, pool.found[chosen]),
+        ],
+        axis=1,
+    )
+
+    def take(leaf: Array, rows: Array = rows) -> Array:
+        return leaf[chosen[:, None], rows]
+
+    return Batch(
+        points=take(pool.points),
+        parts=take(pool.parts).astype(jnp.int32),
+        distance=take(pool.distance),
+        root=take(pool.root),
+        others=take(pool.others, rows[:, :several]),
+        others_valid=take(pool.others_valid, rows[:, :several]),
+        transforms=pool.transforms[chosen],
+        params=jax.tree.map(lambda leaf: leaf[chosen], pool.params),
+    )
+
+
+def _uniform_index(
+    key: PRNGKeyArray, count: int, low: Int[Array, " B"], high: Int[Array, " B"]
+) -> Int[Array, "B n"]:
+    """`count` integers a row, from `low` to below `high`."""
+    u = jax.random.uniform(key, (low.shape[0], count))
+    span = jnp.maximum(high - low, 1)[:, None]
+    return low[:, None] + jnp.minimum((u * span).astype(jnp.int32), span - 1)
+
+
+def make_steps(
+    fields: AvatarFields, pool: FramePool, anchors: Anchors, config: FitConfig
+) -> tuple[TrainState, dict[str, Step]]:
+    """The first state, and the jitted steps `(state, pool) -> (state, terms)` by what they learn.
+
+    With stored roots there is one for "geometry" and, if it is learned, one for "skinning"; with
+    roots searched in the step one for "both". Draws are keyed by seed and step number alone.
+    """
+    learned, fixed = eqx.partition(fields, trainable_filter(fields, config))
+    # A copy: a step gives its input state's memory to the next one.
+    learned = jax.tree.map(jnp.copy, learned)
+    points = config.points_per_step
+    share = float(pool.several.sum() / jnp.maximum(pool.found.sum(), 1))
+    several = min(int(np.ceil(points * share)), points)
+    rates = config.optimiser
+    plans: dict[str, tuple[Any, int, int, float, int]] = {}
+    if config.search.cached:
+        plans["geometry"] = (
+            geometry_objective, points, several, rates.learning_rate, config.steps
+        )
+        if config.skinning.learned:
+            count = min(config.skinning_points, points)
+            plans["skinning"] = (
+                skinning_objective,
+                count,
+                min(several, count),
+                rates.skinning_rate,
+                config.steps // config.skinning_every,
+            )
+    else:
+        plans["both"] = (full_objective, points, 0, rates.learning_rate, config.steps)
+    optimisers, steps = {}, {}
+    for name, (objective, count, many, rate, total) in plans.items():
+        optimiser = make_optimiser(config, rate, total)
+        optimisers[name] = optimiser.init(_own(learned, name))
+        steps[name] = _make_step(
+            name, objective, optimiser, fixed, anchors, config, count, many
+        )
+    return TrainState(learned, optimisers, jnp.zeros((), jnp.int32)), steps
+
+
+def _own(learned: AvatarFields, name: str) -> Any:
+    """The leaves that a step of this name learns."""
+    return {"geometry": learned.geometry, "skinning": learned.skinning, "both": learned}[name]
+
+
+def _with_own(learned: AvatarFields, name: str, own: Any) -> AvatarFields:
+    if name == "both":
+        return own
+    return eqx.tree_at(lambda f: getattr(f, name), learned, own)
+
+
+def _make_step(
+    name: str,
+    objective: Callable[..., Any],
+    optimiser: optax.GradientTransformation,
+    fixed: AvatarFields,
+    anchors: Anchors,
+    config: FitConfig,
+    points: int,
+    several: int,
+) -> Step:
+    fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
+
+    # Frozen arrays are arguments, not constants: baked in, they would be folded at compile time.
+    @eqx.filter_jit(donate="all-except-first")
+    def step(
+        constant: tuple[FramePool, Anchors, Any], state: TrainState
+    ) -> tuple[TrainState, dict[str, Array]]:
+        pool, anchors, fixed_arrays = constant
+        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+        batch_key, loss_key = jax.random.split(key)
+        batch = draw_batch(pool, config, points, several, batch_key)
+
+        def loss(own: Any) -> tuple[Array, dict[str, Array]]:
+            learned = _with_own(state.learned, name, own)
+            fields = eqx.combine(learned, fixed_arrays, static)
+            return objective(fields, batch, anchors, config, loss_key)
+
+        own = _own(state.learned, name)
+        (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
+        updates, optimiser_state = optimiser.update(gradient, state.optimisers[name], own)
+        learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
+        optimisers = {**state.optimisers, name: optimiser_state}
+        label = "loss" if name != "skinning" else "skinning_loss"
+        return TrainState(learned, optimisers, state.step + 1), {label: total, **terms}
+
+    return lambda state, pool: step((pool, anchors, fixed_arrays), state)
+
+
+def with_learned(fields: AvatarFields, state: TrainState) -> AvatarFields:
+    """Fields with the state's learned leaves in place, copied: a step reuses the state's memory."""
+    return eqx.combine(jax.tree.map(jnp.copy, state.learned), fields)

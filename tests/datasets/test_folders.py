@@ -1,0 +1,241 @@
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from xavatar_jax.body import BodyParams, pose_body
+from xavatar_jax.datasets import find_gender, load_data, load_folder, load_frames, load_prepared
+from xavatar_jax.datasets.capture import CaptureNotice
+
+BETAS = np.linspace(-0.8, 0.8, 10)
+SIZES = {
+    "global_orient": 3, "body_pose": 63, "left_hand_pose": 45, "right_hand_pose": 45,
+    "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3, "transl": 3, "expression": 10,
+}  # fmt: skip
+
+
+def frame_params(seed):
+    rng = np.random.default_rng(seed)
+    return {name: 0.3 * rng.normal(size=size) for name, size in SIZES.items()}
+
+
+def absolute_hands(body, params):
+    """By hand: the mean hand, in the order of the tree, added to relative hands."""
+    mean = np.asarray(body.hand_mean)
+    return {
+        **params,
+        "left_hand_pose": params["left_hand_pose"] + mean[25:40].reshape(-1),
+        "right_hand_pose": params["right_hand_pose"] + mean[40:55].reshape(-1),
+    }
+
+
+def posed_mesh(body, params):
+    vertices = pose_body(body, BodyParams.create(body, betas=BETAS, **params)).vertices
+    return trimesh.Trimesh(np.asarray(vertices), body.faces, process=False)
+
+
+def write_prepared(root, body):
+    """What the reference's preparation leaves: hands relative to the mean, stdlib pickles."""
+    seed = 0
+    for part, sequence, count in (("train", "a", 2), ("train", "b", 1), ("test", "c", 2)):
+        folder = root / part / sequence / "SMPLX"
+        folder.mkdir(parents=True)
+        for i in range(count):
+            params = frame_params(seed)
+            seed += 1
+            posed_mesh(body, absolute_hands(body, params)).export(
+                folder / f"mesh-f{i:06d}_smplx.ply"
+            )
+            stored = {k: v.astype(np.float32) for k, v in params.items()} | {"betas": np.zeros(10)}
+            with open(folder / f"mesh-f{i:06d}_smplx.pkl", "wb") as file:
+                pickle.dump(stored, file)
+    (root / "gender.txt").write_text("neutral\n")
+    np.save(root / "mean_shape_smplx.npy", BETAS)
+    return root
+
+
+@pytest.fixture(scope="module")
+def prepared(toy_body, tmp_path_factory):
+    return write_prepared(tmp_path_factory.mktemp("prepared") / "00001", toy_body)
+
+
+def test_prepared_meshes_agree_with_their_parameters(toy_body, prepared):
+    capture = load_data(prepared.parent, toy_body)
+    assert (capture.name, capture.gender, capture.notices) == ("00001", "neutral", ())
+    assert list(capture.train.sequences) == ["a", "b"]
+    assert (len(capture.train), len(capture.test)) == (3, 2)
+    np.testing.assert_allclose(capture.betas, BETAS)
+    for frame in (*capture.train, *capture.test):
+        posed = pose_body(toy_body, frame.params).vertices
+        np.testing.assert_allclose(frame.vertices, posed, atol=1e-5)
+        np.testing.assert_array_equal(frame.part_labels, toy_body.part_labels)
+    assert find_gender(prepared) == "neutral"
+
+
+def test_meshes_of_other_topology_get_the_nearest_labels(toy_body, prepared, tmp_path):
+    shutil.copytree(prepared, tmp_path / "s")
+    path = tmp_path / "s/train/a/SMPLX/mesh-f000000_smplx.ply"
+    mesh = trimesh.load_mesh(path, process=False)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    kept = len(vertices) // 2
+    faces = faces[(faces < kept).all(1)]
+    trimesh.Trimesh(vertices[:kept], faces, process=False).export(path)
+    frame = load_prepared(tmp_path / "s", toy_body).train[0]
+    assert len(frame.vertices) == kept
+    assert (frame.part_labels == toy_body.part_labels[:kept]).mean() > 0.97
+
+
+def test_two_subjects_are_not_one_person(toy_body, prepared, tmp_path):
+    for name in ("00001", "00002"):
+        shutil.copytree(prepared, tmp_path / name)
+    with pytest.raises(ValueError, match="2 subjects"):
+        load_data(tmp_path, toy_body)
+
+
+@pytest.mark.parametrize(("lost", "lacking"), [(".ply", "ply mesh"), (".pkl", "pkl parameters")])
+def test_a_frame_without_its_partner_is_an_error(toy_body, prepared, tmp_path, lost, lacking):
+    shutil.copytree(prepared, tmp_path / "s")
+    (tmp_path / f"s/train/b/SMPLX/mesh-f000000_smplx{lost}").unlink()
+    with pytest.raises(FileNotFoundError, match=f"mesh-f000000_smplx.*no .{lacking}"):
+        load_prepared(tmp_path / "s", toy_body)
+
+
+class Evil:
+    def __reduce__(self):
+        return (print, ("run",))
+
+
+def test_code_in_a_pickle_is_refused(toy_body, prepared, tmp_path):
+    shutil.copytree(prepared, tmp_path / "s")
+    path = tmp_path / "s/test/c/SMPLX/mesh-f000001_smplx.pkl"
+    path.write_bytes(pickle.dumps({**frame_params(0), "betas": Evil()}))
+    with pytest.raises(ValueError, match="not plain data") as error:
+        load_prepared(tmp_path / "s", toy_body)
+    assert "mesh-f000001_smplx.pkl" in str(error.value)
+
+
+def test_an_unreadable_mesh_is_an_error_when_asked_for(toy_body, prepared, tmp_path):
+    shutil.copytree(prepared, tmp_path / "s")
+    (tmp_path / "s/test/c/SMPLX/mesh-f000001_smplx.ply").write_text("no mesh")
+    capture = load_prepared(tmp_path / "s", toy_body)
+    capture.test[0]
+    with pytest.raises(ValueError, match="mesh-f000001_smplx.ply: not a readable mesh"):
+        capture.test[1]
+
+
+def write_frame(folder, name, body, seed, *, mesh=".ply", params=".npz", **changes):
+    folder.mkdir(parents=True, exist_ok=True)
+    values = frame_params(seed)
+    posed_mesh(body, values).export(folder / f"{name}{mesh}")
+    stored = {**values, "betas": BETAS, **changes}
+    if params == ".npz":
+        np.savez(folder / f"{name}.npz", **stored)
+    else:
+        (folder / f"{name}.pkl").write_bytes(pickle.dumps(stored))
+    return values
+
+
+def test_every_shape_of_a_pose_means_the_same(toy_body, tmp_path):
+    values = frame_params(7)
+    body_pose = values["body_pose"].reshape(21, 3)
+    matrices = Rotation.from_rotvec(body_pose).as_matrix()
+    for i, shaped in enumerate((body_pose, body_pose.reshape(1, 63), matrices)):
+        write_frame(tmp_path / "f", f"frame{i}", toy_body, 7, body_pose=shaped)
+    write_frame(tmp_path / "f", "frame3", toy_body, 7, mesh=".obj", params=".pkl")
+    frames = load_frames(tmp_path / "f", toy_body)
+    assert len(frames) == 4
+    np.testing.assert_allclose(frames.params.body_pose, np.tile(body_pose, (4, 1, 1)), atol=1e-6)
+    for frame in frames:
+        posed = pose_body(toy_body, frame.params).vertices
+        np.testing.assert_allclose(frame.vertices, posed, atol=1e-5)
+
+
+def test_relative_hands_by_argument_or_by_file(toy_body, tmp_path):
+    values = write_frame(tmp_path / "f", "a", toy_body, 3)
+    write_frame(tmp_path / "f", "b", toy_body, 3, flat_hand_mean=False)
+    # The mesh of `a` fits absolute hands, so nothing is said of it.
+    hands = load_frames(tmp_path / "f", toy_body).params.left_hand_pose
+    np.testing.assert_allclose(hands[0].reshape(-1), values["left_hand_pose"], atol=1e-6)
+    mean = np.asarray(toy_body.hand_mean)[25:40]
+    np.testing.assert_allclose(hands[1] - hands[0], mean, atol=1e-6)
+    with pytest.warns(CaptureNotice, match="is the mean hand added twice, or missing"):
+        load_frames(tmp_path / "f", toy_body, flat_hand_mean=False)
+
+
+def test_train_and_test_subfolders_make_the_split(toy_body, tmp_path):
+    for i, name in enumerate(("train/s1/a", "train/s1/b", "train/s2/a", "test/s3/a")):
+        folder, stem = (tmp_path / name).parent, name[-1]
+        write_frame(folder, stem, toy_body, i)
+    capture = load_data(tmp_path, toy_body)
+    assert list(capture.train.sequences) == ["train/s1", "train/s2"]
+    assert list(capture.test.sequences) == ["test/s3"]
+    np.testing.assert_allclose(capture.betas, BETAS)
+
+
+def test_sequences_or_trailing_frames_are_held_out(toy_body, tmp_path):
+    for s in range(4):
+        write_frame(tmp_path / f"many/s{s}", "a", toy_body, s)
+    capture = load_folder(tmp_path / "many", toy_body)
+    assert (len(capture.train.sequences), len(capture.test.sequences)) == (3, 1)
+    named = load_folder(tmp_path / "many", toy_body, test=["s2"])
+    assert list(named.test.sequences) == ["s2"]
+    for i in range(5):
+        write_frame(tmp_path / "one", f"f{i}", toy_body, i)
+    capture = load_folder(tmp_path / "one", toy_body)
+    assert (len(capture.train), len(capture.test)) == (4, 1)
+    assert capture.test[0].source.endswith("f4.ply")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"body_pose": np.zeros(60)}, r"body_pose has shape \(60,\), expected \(63,\)"),
+        ({"transl": np.full(3, np.nan)}, "transl is not finite"),
+        ({"left_hand_pose": np.zeros((2, 45))}, r"left_hand_pose has shape \(2, 45\)"),
+    ],
+)
+def test_bad_parameters_name_the_file(toy_body, tmp_path, changes, message):
+    write_frame(tmp_path, "a", toy_body, 0, **changes)
+    with pytest.raises(ValueError, match=message) as error:
+        load_frames(tmp_path, toy_body)
+    assert "a.npz" in str(error.value)
+
+
+def test_missing_parameters_and_partners_are_named(toy_body, tmp_path):
+    write_frame(tmp_path / "k", "a", toy_body, 0)
+    np.savez(tmp_path / "k/a.npz", body_pose=np.zeros(63), transl=np.zeros(3))
+    with pytest.raises(ValueError, match="no global_orient or root_orient; found body_pose, tra"):
+        load_frames(tmp_path / "k", toy_body)
+    write_frame(tmp_path / "m", "a", toy_body, 0)
+    write_frame(tmp_path / "m", "b", toy_body, 0)
+    (tmp_path / "m/b.npz").unlink()
+    with pytest.raises(FileNotFoundError, match=r"b.ply: no parameters beside it \(b.npz"):
+        load_frames(tmp_path / "m", toy_body)
+    (tmp_path / "m/a.ply").rename(tmp_path / "m/b.obj")
+    with pytest.raises(ValueError, match=r"are of one frame"):
+        load_frames(tmp_path / "m", toy_body)
+    (tmp_path / "m/b.obj").unlink()
+    with pytest.raises(FileNotFoundError, match="no parameters beside it"):
+        load_frames(tmp_path / "m", toy_body)
+    with pytest.raises(FileNotFoundError, match="no frames. A frame is NAME.ply"):
+        load_frames(tmp_path / "empty", toy_body)
+
+
+def test_parameters_without_a_mesh_are_named(toy_body, tmp_path):
+    write_frame(tmp_path, "a", toy_body, 0)
+    write_frame(tmp_path, "b", toy_body, 0)
+    (tmp_path / "a.ply").unlink()
+    with pytest.raises(FileNotFoundError, match=r"a.npz: no mesh beside it"):
+        load_frames(tmp_path, toy_body)
+
+
+def test_meshes_in_millimetres_are_noticed(toy_body, tmp_path):
+    values = write_frame(tmp_path, "a", toy_body, 0)
+    mesh = posed_mesh(toy_body, values)
+    mesh.apply_scale(1000.0)
+    mesh.export(tmp_path / "a.ply")
+    with pytest.raises(ValueError, match=r"do not belong together.*units \(metres\)"):
+        load_frames(tmp_path, toy_body)

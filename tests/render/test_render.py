@@ -1,0 +1,196 @@
+"""Pictures against projective geometry, and files against an independent reader."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from xavatar_jax import render
+from xavatar_jax.meshing import Mesh
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def sphere(radius=0.5, centre=(0.0, 0.0, 0.0), color=None) -> Mesh:
+    shape = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    vertices = np.asarray(shape.vertices) + centre
+    colors = None if color is None else np.tile(np.array(color, np.uint8), (len(vertices), 1))
+    return Mesh(vertices, np.asarray(shape.faces), colors=colors)
+
+
+def front_camera(distance=3.0) -> render.Camera:
+    return render.Camera.look_at((0, 0, distance), (0, 0, 0), fov=math.radians(30))
+
+
+def test_camera_follows_opencv():
+    camera = front_camera()
+    # From +z toward the origin: the world's x is right, its y up, so v falls as y grows.
+    u, v, depth = camera.project([[0.1, 0.2, 0.0]], 200, 100)[0]
+    focal = 50 / math.tan(math.radians(15))
+    assert (u, v, depth) == pytest.approx((100 + focal * 0.1 / 3, 50 - focal * 0.2 / 3, 3))
+    assert np.linalg.det(camera.rotation) == pytest.approx(1)
+
+
+def test_rays_pass_through_the_pixels_they_are_for():
+    camera = render.Camera.look_at((1, 2, 3), (0.2, 0.1, 0), fov=0.7)
+    rays = camera.rays(30, 20)
+    points = camera.position + 2.5 * rays[[3, 11], [7, 25]]
+    pixels = camera.project(points, 30, 20)
+    np.testing.assert_allclose(pixels, [[7.5, 3.5, 2.5], [25.5, 11.5, 2.5]], atol=1e-4)
+    window = camera.rays(60, 40, slice(2, 5), slice(10, 14), supersample=2)
+    np.testing.assert_array_equal(window, camera.rays(60, 40)[4:10, 20:28])
+
+
+def test_silhouette_of_a_sphere():
+    picture = render.render_mesh(sphere(), front_camera(), 200, background=None)
+    coverage = picture[..., 3].sum() / 255.0
+    # A sphere's outline is the cone that touches it.
+    slope = 0.5 / math.sqrt(3**2 - 0.5**2)
+    focal = 100 / math.tan(math.radians(15))
+    assert coverage == pytest.approx(np.pi * (focal * slope) ** 2, rel=5e-3)
+
+
+def test_normals_in_the_camera_frame():
+    picture = render.render_mesh(sphere(), front_camera(), 201, shading="normal", supersample=1)
+    np.testing.assert_allclose(picture[100, 100], [128, 128, 255], atol=2)
+    assert picture[100, 130, 0] > 160
+    assert picture[70, 100, 1] > 160
+
+
+def test_flat_shading_shows_the_colours_and_the_nearer_mesh_wins():
+    near, far = sphere(0.3, (0, 0, 1), (255, 0, 0)), sphere(0.5, (0, 0, 0), (0, 0, 255))
+    mesh = Mesh(
+        np.concatenate([near.vertices, far.vertices]),
+        np.concatenate([near.faces, far.faces + near.num_vertices]),
+        colors=np.concatenate([near.colors, far.colors]),
+    )
+    picture = render.render_mesh(mesh, front_camera(), 101, shading="flat", background=WHITE)
+    np.testing.assert_array_equal(picture[50, 50], [255, 0, 0])
+    np.testing.assert_array_equal(picture[0, 0], [255, 255, 255])
+    assert (picture == [0, 0, 255]).all(axis=-1).any()
+
+
+def test_light_comes_from_the_upper_left():
+    picture = render.render_mesh(sphere(), front_camera(), 120).astype(float).mean(axis=-1)
+    assert picture[45, 45] > picture[75, 75] + 20
+
+
+def test_ground_is_dark_under_the_mesh_only():
+    camera = render.frame_view(sphere().vertices, elevation=0.5, margin=2.0)
+    lit = render.render_mesh(sphere(), camera, 128, ground=True).astype(int)
+    plain = render.render_mesh(sphere(), camera, 128).astype(int)
+    darker = (plain - lit).mean(axis=-1)
+    assert darker.min() >= -1
+    below = camera.project([[0, -0.5, 0.3]], 128, 128)[0].astype(int)
+    assert darker[below[1], below[0]] > 25 or lit[below[1], below[0]].mean() < 200
+    assert darker[0].max() == 0
+    clear = render.render_mesh(sphere(), camera, 128, ground=True, background=None)
+    assert clear[0, 0, 3] == 0
+
+
+@pytest.mark.parametrize("view", ["front", "three_quarter", "left", "back", "right"])
+def test_framed_points_fill_the_picture(view):
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [0.9, 1.7, 0.3] + [3, 1, -2]
+    camera = render.frame_view(points, view, aspect=0.75, margin=1.0)
+    pixels = camera.project(points, 300, 400)
+    assert pixels[:, :2].min() > -1
+    assert (pixels[:, :2].max(axis=0) < [301, 401]).all()
+    filled = (pixels[:, :2].max(axis=0) - pixels[:, :2].min(axis=0)) / [300, 400]
+    assert filled.max() > 0.97
+
+
+def test_the_persons_left_is_on_the_right_of_a_front_view():
+    points = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 2, 0]])
+    left, right, top = render.frame_view(points, "front").project(points, 100, 100)
+    assert left[0] > right[0]
+    assert top[1] < left[1]
+    behind = render.frame_view(points, "back").project(points, 100, 100)
+    assert behind[0, 0] < behind[1, 0]
+
+
+def test_a_flat_part_is_seen_on_its_broad_side():
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3)) * [0.1, 0.01, 0.06]
+    camera = render.part_view(points)
+    assert abs(camera.rotation[2, 1]) > 0.99
+    assert camera.position[1] > 0
+
+
+def test_error_colors():
+    colors = render.error_colors([0.0, 1.0, 2.0, 5.0, np.nan], 2.0).astype(int)
+    assert colors[0, 2] > colors[0, 0]
+    assert colors[2, 0] > colors[2, 2]
+    np.testing.assert_array_equal(colors[2], colors[3])
+    np.testing.assert_array_equal(colors[4], 160)
+    steps = np.abs(np.diff(render.error_colors(np.linspace(0, 1, 200), 1.0).astype(int), axis=0))
+    assert steps.max() < 10
+    with pytest.raises(ValueError, match="max_mm must be positive"):
+        render.error_colors([1.0], 0.0)
+
+
+def test_color_bar_reads_upwards():
+    bar = render.color_bar(3.0, (70, 300)).astype(int)
+    assert bar[45, 10, 0] > bar[45, 10, 2]
+    assert bar[255, 10, 2] > bar[255, 10, 0]
+
+
+def test_grid_keeps_every_picture_whole():
+    red, green = np.zeros((2, 40, 30, 3), np.uint8)
+    red[..., 0], green[..., 1] = 255, 255
+    tall = np.zeros((60, 20, 4), np.uint8)
+    tall[..., 2:] = 255
+    sheet = render.grid_picture(
+        [[red, green], [tall]], column_labels=["one", "two"], row_labels=["a", "b"], title="title"
+    )
+    for color, count in (((255, 0, 0), 1200), ((0, 255, 0), 1200), ((0, 0, 255), 1200)):
+        assert (sheet == color).all(axis=-1).sum() == count
+    plain = render.grid_picture([[red]])
+    assert (sheet[:50] < 120).any()
+    assert not (plain[:3] < 120).any()
+    with pytest.raises(ValueError, match="no pictures"):
+        render.grid_picture([])
+
+
+def test_files_are_read_back(tmp_path):
+    picture = render.render_mesh(sphere(), front_camera(), (64, 48))
+    render.save_png(tmp_path / "p.png", picture)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "p.png")), picture)
+    frames = [np.full((32, 48, 3), level, np.uint8) for level in (0, 120, 250)]
+    render.save_webp_animation(frames, tmp_path / "a.webp", fps=10)
+    with Image.open(tmp_path / "a.webp") as animation:
+        assert animation.n_frames == 3
+        assert animation.size == (48, 32)
+        animation.seek(1)
+        animation.load()
+        assert animation.info["duration"] == 100
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.webp", "p.png"]
+
+
+def test_bad_pictures_are_refused_and_leave_no_file(tmp_path):
+    with pytest.raises(ValueError, match="uint8"):
+        render.save_png(tmp_path / "p.png", np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match="at least one frame"):
+        render.save_webp_animation([], tmp_path / "a.webp")
+    frames = [np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)]
+    with pytest.raises(ValueError, match="differ in shape"):
+        render.save_webp_animation(frames, tmp_path / "a.webp")
+    with pytest.raises(ValueError, match="no shading 'shiny'"):
+        render.render_mesh(sphere(), front_camera(), 8, shading="shiny")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_importing_loads_no_heavy_library():
+    code = (
+        "import sys\n"
+        "from xavatar_jax import export, geometry, meshing, metrics, render\n"
+        "heavy = {'trimesh', 'scipy', 'skimage', 'igl', 'embreex', 'PIL', 'pygltflib', 'viser'}\n"
+        "before = set(sys.modules) & heavy\n"
+        "print(sorted(before))\n"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = found.stdout.strip()
+    # JAX itself loads SciPy.
+    assert loaded in ("[]", "['scipy']")
