@@ -122,7 +122,7 @@ def test_an_unreadable_mesh_is_an_error_when_asked_for(toy_body, prepared, tmp_p
     (tmp_path / "s/test/c/SMPLX/mesh-f000001_smplx.ply").write_text("no mesh")
     capture = load_prepared(tmp_path / "s", toy_body)
     capture.test[0]
-    with pytest.raises(ValueError, match="mesh-f000001_smplx.ply: not a readable mesh"):
+    with pytest.raises(ValueError, match=r"mesh-f000001_smplx.ply: not a readable mesh"):
         capture.test[1]
 
 
@@ -220,7 +220,7 @@ def test_missing_parameters_and_partners_are_named(toy_body, tmp_path):
     (tmp_path / "m/b.obj").unlink()
     with pytest.raises(FileNotFoundError, match="no parameters beside it"):
         load_frames(tmp_path / "m", toy_body)
-    with pytest.raises(FileNotFoundError, match="no frames. A frame is NAME.ply"):
+    with pytest.raises(FileNotFoundError, match=r"no frames. A frame is NAME.ply"):
         load_frames(tmp_path / "empty", toy_body)
 
 

@@ -107,7 +107,7 @@ def test_one_sequence_cannot_be_split():
 def test_gender_mismatch_is_an_error_unless_overridden(toy_body, tmp_path):
     write_sequence(tmp_path / "train/a.npz", gender="female")
     write_sequence(tmp_path / "test/b.npz", gender="female")
-    with pytest.raises(ValueError, match="sequences is female, but the body .* is neutral"):
+    with pytest.raises(ValueError, match=r"sequences is female, but the body .* is neutral"):
         load_grab(tmp_path, toy_body)
     with pytest.warns(CaptureNotice, match="files say female, taken as neutral"):
         assert load_grab(tmp_path, toy_body, gender="neutral").gender == "neutral"

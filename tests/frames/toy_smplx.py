@@ -15,9 +15,9 @@ HAND_MEAN_DEG = 9.0
 
 def _tip(name: str, joint: np.ndarray, parent: np.ndarray) -> np.ndarray | None:
     if name == "head":
-        return joint + (0.0, 0.12, 0.02)
+        return joint + np.array([0.0, 0.12, 0.02])
     if name.endswith("_foot"):
-        return joint + (0.0, -0.01, 0.06)
+        return joint + np.array([0.0, -0.01, 0.06])
     if name[-1] == "3" and name != "spine3":
         return joint + 0.018 * (joint - parent) / np.linalg.norm(joint - parent)
     return None

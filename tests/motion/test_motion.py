@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -48,9 +49,13 @@ def amass_arrays(count=5, seed=1):
     }
 
 
+@eqx.filter_jit
+def _posed(body, params):
+    return jax.vmap(lambda p: pose_body(body, p).vertices)(params)
+
+
 def posed(body, motion):
-    with_params = jax.jit(jax.vmap(lambda p: pose_body(body, p).vertices))
-    return np.asarray(with_params(motion.to_params(body)))
+    return np.asarray(_posed(body, motion.to_params(body)))
 
 
 @settings(max_examples=10, deadline=None)

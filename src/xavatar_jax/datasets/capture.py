@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from xavatar_jax.body import BodyModel
+from xavatar_jax.body import BodyModel, BodyParams
 from xavatar_jax.frames import Frames
 
-NUM_TRAIN, NUM_TEST = 9, 3  # sequences, as X-Avatar splits a GRAB subject (section 4.1)
+NUM_TRAIN, NUM_TEST = 9, 3  # sequences, as in X-Avatar's experiments on GRAB
 
 
 class CaptureNotice(UserWarning):
@@ -148,17 +150,13 @@ def resolve_gender(
     return subject, notices
 
 
-def concatenate_params(parts):
+def concatenate_params(parts: Sequence[BodyParams]) -> BodyParams:
     """Join batched parameters along the batch axis, coefficients filled with zeros to one size."""
-    import jax
-    import jax.numpy as jnp
 
-    def padded(part, name: str):
+    def padded(part: BodyParams, name: str) -> Array:
         size = max(getattr(p, name).shape[-1] for p in parts)
         values = getattr(part, name)
         return jnp.pad(values, ((0, 0), (0, size - values.shape[-1])))
-
-    from dataclasses import replace
 
     parts = [
         replace(p, betas=padded(p, "betas"), expression=padded(p, "expression")) for p in parts

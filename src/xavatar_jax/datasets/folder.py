@@ -172,8 +172,8 @@ def _held_out(
         if held == count:
             raise ValueError(f"{folder}: one frame only; training and test need one each.")
         return np.arange(count) >= count - held
-    train_names, test_names = split_names(names, test=test, seed=seed, source=folder)
-    del train_names  # all that is not held out is for training
+    # All that is not held out is for training, however many sequences there are.
+    _, test_names = split_names(names, test=test, seed=seed, source=folder)
     return np.isin(sequences, test_names)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -128,8 +129,6 @@ def check_first_frame(frames: Frames, body: BodyModel, *, flat_hand_mean: bool) 
 
 
 def _other_hands(body: BodyModel, params: BodyParams, flat_hand_mean: bool) -> BodyParams:
-    from dataclasses import replace
-
     pose = params.pose
     for side in ("left", "right"):
         joints = np.array(pose_groups(body.tree)[f"{side}_hand_pose"], dtype=int)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -34,10 +35,13 @@ class _ChumpyArray:
 
     def array(self) -> np.ndarray:
         state = self._state
-        if isinstance(state, dict):
-            for name in ("x", "a"):
-                if name in state:
-                    return _plain(state[name])
+        if isinstance(state, dict) and "x" in state:
+            return _plain(state["x"])
+        if isinstance(state, dict) and "a" in state and "idxs" in state:
+            # chumpy's Select: entries of another array, in another order and shape.
+            chosen = np.ravel(_plain(state["a"]))[np.asarray(_plain(state["idxs"]), np.int64)]
+            shape = state.get("preferred_shape")
+            return chosen if shape is None else chosen.reshape(tuple(shape))
         if isinstance(state, np.ndarray):
             return state
         raise UnsafePickleError(
@@ -95,8 +99,11 @@ def _plain(value: Any) -> Any:
 
 
 def _unpickle(file: BinaryIO) -> Any:
-    # latin1 reads the byte strings of arrays that Python 2 pickled.
-    return _plain(_RestrictedUnpickler(file, encoding="latin1").load())
+    with warnings.catch_warnings():
+        # Every array that an older NumPy pickled carries its flag as a number: no news to a user.
+        warnings.filterwarnings("ignore", message=r"dtype\(\): align should be passed")
+        # latin1 reads the byte strings of arrays that Python 2 pickled.
+        return _plain(_RestrictedUnpickler(file, encoding="latin1").load())
 
 
 def load_pickle(path: str | os.PathLike[str]) -> Any:
@@ -155,9 +162,3 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"{os.fspath(path)}: not a readable .npz archive (entry {name!r}: {error})"
         ) from error
     return entries
-
-
-
-
-
-

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -28,7 +29,7 @@ def rest_pelvis(body: BodyModel, betas: Float[np.ndarray, " S"]) -> Float[np.nda
         body: the body model.
         betas: shape coefficients, cut to the body's number.
     """
-    fitted = np.asarray(betas)[: body.num_betas]
+    fitted = jnp.asarray(betas[: body.num_betas], float)
     return np.asarray(rest_joints(body, fitted)[0], np.float64)
 
 

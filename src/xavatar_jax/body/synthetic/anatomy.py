@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from .field import (
     Sweep,
+    Vector,
     carve,
     cone,
     ellipsoid,
@@ -44,7 +45,7 @@ def _along_y(keys: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
 _Piece = tuple[Callable[[np.ndarray], np.ndarray], np.ndarray, float]
 
 
-def _box(*points: Sequence[float], pad: float) -> np.ndarray:
+def _box(*points: Vector, pad: float) -> np.ndarray:
     stacked = np.asarray(points, dtype=float)
     return np.stack([stacked.min(0) - pad, stacked.max(0) + pad])
 

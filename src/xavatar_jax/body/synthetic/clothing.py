@@ -12,7 +12,7 @@ SLEEVE = 0.315  # end of the sleeves, |x|
 
 def neckline(p: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
     """Above zero inside the T-shirt's round neck, about metres to its edge."""
-    q = (p - np.array([0.0, 0.175, -0.012])) / np.array([0.090, 0.090, 0.112])
+    q = (p - np.array([0.0, 0.175, 0.002])) / np.array([0.090, 0.090, 0.104])
     return 0.09 * (1.0 - np.sqrt((q * q).sum(1)))
 
 
@@ -22,5 +22,5 @@ def distance_to_lines(p: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
     on_trunk = x < 0.30
     away = np.where(on_trunk, np.minimum(np.abs(y - HEM), np.abs(y - CUFF)), 1.0)
     away = np.minimum(away, np.abs(x - SLEEVE))
-    collar = np.where(y < 0.22, np.abs(neckline(p)), 1.0)
+    collar = np.where(y < 0.20, np.abs(neckline(p)), 1.0)
     return np.minimum(away, collar)

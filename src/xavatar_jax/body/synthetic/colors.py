@@ -75,7 +75,7 @@ def synthetic_colors(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, "V 3
     paint(_soft(np.where(head, hair, -1.0), 0.009), _HAIR)
 
     cloth = np.minimum(np.minimum(SLEEVE - x, y - HEM), -neckline(p))
-    shirt = np.where(head | (y > 0.30), -1.0, cloth)
+    shirt = np.where(head | (y > 0.20), -1.0, cloth)
     # Trousers first, reaching under the shirt's hem, so that no skin shows between them.
     legs = np.minimum(HEM + 0.05 - y, y - CUFF)
     paint(_soft(np.where(x < 0.4, legs, -1.0), 0.009), _TROUSERS)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 Values = Float[np.ndarray, " N"]
 Points = Float[np.ndarray, "N 3"]
+Vector = Sequence[float] | np.ndarray
 Field = Callable[[np.ndarray], np.ndarray]
 
 
@@ -38,7 +39,9 @@ def carve(a: Values, tool: Values, radius: float) -> Values:
     return smooth_max(a, -tool, radius)
 
 
-def _scaled_norm_distance(scaled: Sequence[Values], radii: Sequence[np.ndarray | float]) -> Values:
+def _scaled_norm_distance(
+    scaled: Sequence[Values], radii: Sequence[np.ndarray | float] | np.ndarray
+) -> Values:
     """First-order distance to the unit ball of axes `radii` for coordinates already divided."""
     squared = sum(s * s for s in scaled)
     slope = sum((s / r) ** 2 for s, r in zip(scaled, radii, strict=True))
@@ -53,9 +56,7 @@ def _scaled_norm_distance(scaled: Sequence[Values], radii: Sequence[np.ndarray |
     return (k0 - 1.0) * depth
 
 
-def ellipsoid(
-    p: Points, centre: Sequence[float], radii: Sequence[float], axes: np.ndarray | None = None
-) -> Values:
+def ellipsoid(p: Points, centre: Vector, radii: Vector, axes: np.ndarray | None = None) -> Values:
     """Ellipsoid; rows of `axes` are its directions (the world's by default)."""
     q = p - np.asarray(centre)
     if axes is not None:
@@ -63,14 +64,12 @@ def ellipsoid(
     return _scaled_norm_distance([q[:, i] / radii[i] for i in range(3)], radii)
 
 
-def sphere(p: Points, centre: Sequence[float], radius: float) -> Values:
+def sphere(p: Points, centre: Vector, radius: float) -> Values:
     """Exact distance to a sphere."""
     return np.sqrt(((p - np.asarray(centre)) ** 2).sum(1)) - radius
 
 
-def cone(
-    p: Points, start: Sequence[float], end: Sequence[float], r_start: float, r_end: float
-) -> Values:
+def cone(p: Points, start: Vector, end: Vector, r_start: float, r_end: float) -> Values:
     """Capsule whose radius goes linearly from one end to the other."""
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     axis = end - start
@@ -90,10 +89,10 @@ class Sweep:
 
     def __init__(
         self,
-        origin: Sequence[float],
-        axis: Sequence[float],
-        u: Sequence[float],
-        keys: Sequence[Sequence[float]],
+        origin: Vector,
+        axis: Vector,
+        u: Vector,
+        keys: Sequence[Vector] | np.ndarray,
         caps: tuple[float, float],
         squareness: float = 2.0,
     ):

@@ -153,7 +153,7 @@ def hair_edge(p: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
     front = 0.389 + 0.35 * (0.085 - z) - 3.0 * x * x
     front = front + 0.010 * np.exp(-(((x - 0.043) / 0.017) ** 2))
     # Down the temple to the sideburn, round the ear, and along the nape.
-    temple = 0.388 - 0.055 * _step((0.050 - z) / 0.030)
+    temple = 0.402 - 0.069 * _step((0.050 - z) / 0.030)
     temple = temple - 0.010 * _step((0.014 - z) / 0.010)
     nape = 0.3065 - 0.040 * _step((-0.018 - z) / 0.035)
     line = np.where(z > -0.010, np.minimum(front, temple), nape)

@@ -54,11 +54,11 @@ def _embed(
 ) -> tuple[np.ndarray, np.ndarray]:
     import igl
 
-    _, face, nearest = igl.point_mesh_squared_distance(points, vertices, faces.astype(np.int64))
+    _, found, nearest = igl.point_mesh_squared_distance(points, vertices, faces.astype(np.int64))
+    face = np.asarray(found)
     a, b, c = (vertices[faces[face, i]] for i in range(3))
-    bary = igl.barycentric_coordinates(nearest, a, b, c)
-    bary = np.clip(bary, 0.0, None)
-    return face.astype(np.int64), bary / bary.sum(1, keepdims=True)
+    bary = np.clip(np.asarray(igl.barycentric_coordinates(nearest, a, b, c)), 0.0, None)
+    return np.asarray(face, dtype=np.int64), bary / bary.sum(1, keepdims=True)
 
 
 def landmarks(

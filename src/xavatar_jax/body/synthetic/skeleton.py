@@ -77,8 +77,8 @@ _THUMB_RAY = (
 
 
 def _unit(vector: tuple[float, ...]) -> np.ndarray:
-    vector = np.asarray(vector, dtype=np.float64)
-    return vector / np.linalg.norm(vector)
+    array = np.asarray(vector, dtype=np.float64)
+    return array / np.linalg.norm(array)
 
 
 def finger_chain(finger: str) -> Float[np.ndarray, "4 3"]:

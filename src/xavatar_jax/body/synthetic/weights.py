@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .head import EYE, EYE_RADIUS, lid_opening, mouth_line
+from .sizing import edge_length
 from .skeleton import (
     FINGERS,
     JOINT_INDEX,
@@ -24,7 +25,7 @@ from .skeleton import (
 # Standard deviation of the diffusion in metres, by joint (sides alike).
 _WIDTHS = {
     "pelvis": 0.042, "spine1": 0.042, "spine2": 0.042, "spine3": 0.040, "hip": 0.038,
-    "knee": 0.030, "ankle": 0.020, "foot": 0.017, "neck": 0.030, "head": 0.022, "jaw": 0.0090,
+    "knee": 0.030, "ankle": 0.020, "foot": 0.017, "neck": 0.030, "head": 0.022, "jaw": 0.0100,
     "eye": 0.0008, "collar": 0.034, "shoulder": 0.028, "elbow": 0.025, "wrist": 0.013,
     "index": 0.0057, "middle": 0.0057, "ring": 0.0055, "pinky": 0.0050, "thumb": 0.0066,
 }  # fmt: skip
@@ -173,6 +174,9 @@ def skinning_weights(
     """Smooth weights (V, 55); rows sum to one."""
     label = segment(vertices)
     width = np.array([_width_of(j) for j in range(len(JOINT_NAMES))])[label]
+    # A transition cannot be sharper than the mesh (the eyelids' rim is meant to be).
+    edge = edge_length(vertices)
+    width = np.where(edge > 0.003, np.maximum(width, 1.1 * edge), width)
     # The width itself must not jump, else the diffusion would.
     for _ in range(2):
         width = np.exp(diffuse(np.log(width)[:, None], 0.5 * width, operators, steps=1)[:, 0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -46,7 +47,9 @@ def animate(
         seed: of the noise.
     """
     names = body.tree.names
-    joints = dict(zip(names, np.asarray(rest_joints(body, betas), np.float64), strict=True))
+    joints = dict(
+        zip(names, np.asarray(rest_joints(body, jnp.asarray(betas)), np.float64), strict=True)
+    )
     times = np.array([key.time for key in keys])
     frames = np.arange(0.0, times[-1] + 1e-9, 1.0 / fps)
     noise = _Noise(frames, np.random.default_rng(seed))

@@ -78,6 +78,8 @@ class Foot(NamedTuple):
 
 STANDING = (Foot(0.11, yaw=6.0), Foot(-0.11, yaw=-6.0))
 
+_ARM, _TORSO, _GAZE, _PELVIS = Arm(), Torso(), Gaze(), Pelvis()
+
 
 @dataclass(frozen=True)
 class Key:
@@ -95,13 +97,13 @@ class Key:
     """
 
     time: float = 0.0
-    left: Arm = Arm()
-    right: Arm = Arm()
+    left: Arm = _ARM
+    right: Arm = _ARM
     left_hand: str = "relaxed"
     right_hand: str = "relaxed"
-    torso: Torso = Torso()
-    gaze: Gaze = Gaze()
-    pelvis: Pelvis = Pelvis()
+    torso: Torso = _TORSO
+    gaze: Gaze = _GAZE
+    pelvis: Pelvis = _PELVIS
     left_foot: Foot = STANDING[0]
     right_foot: Foot = STANDING[1]
     face: dict[int, float] = field(default_factory=dict)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-Range = tuple[float, float]
+Range = tuple[float | int, float | int]
 
 # (x, y, z): on the midline x is bending forwards, y turning left, z leaning to the right.
 _MIDLINE: dict[str, tuple[Range, Range, Range]] = {

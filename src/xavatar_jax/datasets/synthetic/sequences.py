@@ -153,20 +153,22 @@ def _turning() -> list[Key]:
         swing = 1 if i % 2 else -1
         keys.append(
             keys[-1].then(
-                0.32, left_foot=foot(1, mid, 0.07), pelvis=Pelvis(-0.035, -0.02, 0, mid - 8),
+                0.32, left_foot=foot(1.0, mid, 0.07), pelvis=Pelvis(-0.035, -0.02, 0, mid - 8),
                 left=Arm(14 - 26 * swing, -70, 0.9), right=Arm(14 + 26 * swing, -70, 0.9),
                 gaze=Gaze(22, -4), torso=Torso(3, 0, 10),
             )
         )  # fmt: skip
-        keys.append(keys[-1].then(0.24, left_foot=foot(1, end), pelvis=Pelvis(0, -0.02, 0, mid)))
+        keys.append(keys[-1].then(0.24, left_foot=foot(1.0, end), pelvis=Pelvis(0, -0.02, 0, mid)))
         keys.append(
             keys[-1].then(
-                0.30, right_foot=foot(-1, mid, 0.07), pelvis=Pelvis(0.035, -0.02, 0, end - 8),
+                0.30, right_foot=foot(-1.0, mid, 0.07), pelvis=Pelvis(0.035, -0.02, 0, end - 8),
                 gaze=Gaze(8, 0), left=Arm(14 + 20 * swing, -68, 0.85),
                 right=Arm(14 - 20 * swing, -68, 0.88),
             )
         )  # fmt: skip
-        keys.append(keys[-1].then(0.24, right_foot=foot(-1, end), pelvis=Pelvis(0, -0.02, 0, end)))
+        keys.append(
+            keys[-1].then(0.24, right_foot=foot(-1.0, end), pelvis=Pelvis(0, -0.02, 0, end))
+        )
         yaw = end
     keys.append(keys[-1].then(0.6, both=_DOWN, gaze=Gaze(), torso=Torso()))
     return keys
@@ -239,8 +241,8 @@ def _drink_and_phone() -> list[Key]:
         {"seconds": 0.6, "right": mouth._replace(tilt=20, height=16, palm=20),
          "gaze": Gaze(0, 16)},
         {"seconds": 0.7, "right": Arm(8, -32, 0.80), "gaze": Gaze(-4, -16), "jaw": 1.0, "face": {}},
-        {"seconds": 0.7, "right": _DOWN, "right_hand": "relaxed", "left": Arm(4, -30, 0.72, palm=40),
-         "left_hand": "phone"},
+        {"seconds": 0.7, "right": _DOWN, "right_hand": "relaxed",
+         "left": Arm(4, -30, 0.72, palm=40), "left_hand": "phone"},
         {"seconds": 0.7, "left": ear, "gaze": Gaze(8, 0, 8), "talk": 0.9},
         {"seconds": 0.7, "gaze": Gaze(-14, 4, 6), "right": Arm(16, -46, 0.7, palm=30),
          "right_hand": "relaxed"},
@@ -307,7 +309,8 @@ def _lunge_and_throw() -> list[Key]:
         {"seconds": 0.5, "right": Arm(-16, 14, 0.95, palm=-60, bend=30), "right_hand": "gun",
          "left": Arm(100, -38, 0.8), "left_hand": "shaka", "torso": Torso(18, 0, 24),
          "gaze": Gaze(-14, 6), "face": {OPEN: 1.6, NOSE: 1.0}, "jaw": 18.0},
-        {"seconds": 0.4, "left_foot": Foot(0.12, 0.07, 0.22), "pelvis": Pelvis(-0.05, -0.16, -0.04)},
+        {"seconds": 0.4, "left_foot": Foot(0.12, 0.07, 0.22),
+         "pelvis": Pelvis(-0.05, -0.16, -0.04)},
         {"seconds": 0.4, "left_foot": Foot(0.13, 0, 0.05), "pelvis": Pelvis(0.06, -0.08, 0),
          "right_foot": Foot(-0.14, 0.05, -0.13, -12)},
         {"seconds": 0.4, "right_foot": Foot(-0.15, 0, -0.02, -8),

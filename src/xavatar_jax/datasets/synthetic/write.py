@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+from contextlib import suppress
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -16,7 +19,6 @@ from xavatar_jax.datasets.synthetic.sequences import TEST_SEQUENCES, TRAIN_SEQUE
 from xavatar_jax.files import atomic_folder, cache_dir
 from xavatar_jax.motion import Motion, save_amass
 
-SYNTHETIC_CAPTURE_VERSION = "1"
 FPS = 30.0
 _SEED = 20
 # Direction of the person's shape; `subject_betas` sets how far along it.
@@ -24,11 +26,20 @@ _SHAPE_DIRECTION = np.array([-0.9, 0.8, -0.5, 0.4, 0.5, 0.7, -0.4, 0.3, 0.6, 0.5
 _SHAPE_MEDIAN_M = 0.014
 
 
+def code_checksum() -> str:
+    """A short checksum of the code that makes the motions, so that old ones are not reused."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 def subject_betas(body: BodyModel) -> Float[np.ndarray, " S"]:
     """Shape of the captured person: a median vertex lies 14 mm from that of the mean shape."""
     betas = np.zeros(min(body.num_betas, len(_SHAPE_DIRECTION)))
     betas[:] = _SHAPE_DIRECTION[: len(betas)]
-    offset = np.asarray(rest_vertices(body, betas)) - np.asarray(rest_vertices(body, 0 * betas))
+    own, mean = (rest_vertices(body, jnp.asarray(b)) for b in (betas, 0 * betas))
+    offset = np.asarray(own) - np.asarray(mean)
     median = float(np.median(np.linalg.norm(offset, axis=1)))
     if median == 0.0:
         raise ValueError(
@@ -102,11 +113,9 @@ def synthetic_capture(
         verbose: show a progress bar.
     """
     body = synthetic_body(cache) if body is None else body
-    key = f"synthetic_capture-{SYNTHETIC_CAPTURE_VERSION}-{body.source.checksum[:12]}"
+    key = f"synthetic_capture-{code_checksum()}-{body.source.checksum[:12]}"
     folder = cache_dir(cache) / key
     if not folder.is_dir():
-        try:
+        with suppress(FileExistsError):  # another process was quicker
             write_synthetic_capture(folder, body)
-        except FileExistsError:
-            pass  # another process was quicker
     return load_grab(folder, body, gender=None, verbose=verbose)

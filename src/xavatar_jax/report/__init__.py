@@ -1,0 +1,8 @@
+"""What a run leaves behind: metrics, pictures, an animation, meshes."""
+
+from .machine import describe_machine as describe_machine
+from .metrics_file import metrics_record as metrics_record
+from .metrics_file import metrics_table as metrics_table
+from .metrics_file import write_json as write_json
+from .pictures import animation as animation
+from .pictures import preview as preview

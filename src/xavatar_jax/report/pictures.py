@@ -1,0 +1,98 @@
+"""Pictures of an avatar beside the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import UInt8
+
+from ..avatar import Avatar
+from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyParams
+from ..frames import Frame, Frames
+from ..geometry import closest_points
+from ..kinematics import axis_angle_to_matrix
+from ..meshing import Mesh
+from ..render import (
+    Camera,
+    color_bar,
+    error_colors,
+    frame_view,
+    grid_picture,
+    part_view,
+    render_mesh,
+)
+
+_SKIN = (0.80, 0.66, 0.57)
+_TRUTH = (0.72, 0.74, 0.78)
+
+
+def preview(
+    avatar: Avatar, frame: Frame, *, size: int = 420, max_error_mm: float = 2.0
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Ground truth, avatar and its distance to the truth: whole body, hands and face."""
+    truth = Mesh(frame.vertices, frame.faces).compute_normals()
+    mesh = avatar.mesh(frame.params).compute_normals()
+    distance, _, _ = closest_points(truth.vertices, truth.faces, mesh.vertices)
+    error = replace(mesh, colors=error_colors(1000 * distance, max_error_mm))
+    labels = np.asarray(avatar.body.part_labels)
+    template = avatar.posed_template(frame.params)
+    forward = _facing(frame.params)
+    views: list[tuple[str, Camera, float]] = [
+        ("body", frame_view(template, "three_quarter", forward=forward, aspect=0.8), 1.25)
+    ]
+    for name, parts in (
+        ("left hand", (LEFT_HAND,)),
+        ("right hand", (RIGHT_HAND,)),
+        ("face", FACES),
+    ):
+        own = template[np.isin(labels, parts)]
+        if len(own):
+            direction = forward if name == "face" else None
+            views.append((name, part_view(own, direction, forward=forward), 1.0))
+    rows = []
+    for _, camera, tall in views:
+        shape = (int(size / tall**0.5), int(size * tall**0.5))
+        rows.append(
+            [
+                render_mesh(truth, camera, shape, base_color=_TRUTH),
+                render_mesh(mesh, camera, shape, base_color=_SKIN),
+                render_mesh(error, camera, shape, shading="error"),
+            ]
+        )
+    rows[0].append(color_bar(max_error_mm, (70, rows[0][0].shape[0])))
+    return grid_picture(
+        rows,
+        column_labels=["ground truth", "avatar", "distance (mm)"],
+        row_labels=[name for name, _, _ in views],
+    )
+
+
+def animation(
+    avatar: Avatar, frames: Frames, *, size: int = 360, count: int = 48
+) -> list[UInt8[np.ndarray, "H W 3"]]:
+    """The avatar beside the truth, `count` frames of one sequence from a fixed camera."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
+    reach = np.concatenate(
+        [avatar.posed_template(frames[int(k)].params) for k in chosen[:: max(len(chosen) // 8, 1)]]
+    )
+    camera = frame_view(reach, "front", forward=_facing(frames[int(chosen[0])].params))
+    pictures = []
+    for k in chosen:
+        frame = frames[int(k)]
+        truth = Mesh(frame.vertices, frame.faces).compute_normals()
+        mesh = avatar.mesh(frame.params).compute_normals()
+        row = [
+            render_mesh(truth, camera, size, base_color=_TRUTH),
+            render_mesh(mesh, camera, size, base_color=_SKIN),
+        ]
+        pictures.append(grid_picture([row], column_labels=["ground truth", "avatar"]))
+    return pictures
+
+
+def _facing(params: BodyParams) -> tuple[float, float, float]:
+    """Where the person looks, along the ground: the root's rotation of +Z."""
+    forward = np.asarray(axis_angle_to_matrix(params.global_orient))[:, 2]
+    x, z = float(forward[0]), float(forward[2])
+    length = float(np.hypot(x, z))
+    return (0.0, 0.0, 1.0) if length < 1e-3 else (x / length, 0.0, z / length)
