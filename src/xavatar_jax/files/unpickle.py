@@ -12,7 +12,6 @@ import os
 import pickle
 import warnings
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -51,16 +50,15 @@ class _ChumpyArray:
 
 
 _NUMPY_MODULES = ("numpy", "numpy.core", "numpy._core")
-_ALLOWED = {
-    ("builtins", name)
-    for name in (
-        *("dict", "list", "tuple", "set", "frozenset", "str", "bytes", "bytearray"),
-        *("int", "float", "complex", "bool", "slice", "range"),
-    )
-} | {("__builtin__", name) for name in ("dict", "list", "tuple", "set", "str", "int", "float", "bool")}
+_BUILTINS = (
+    *("dict", "list", "tuple", "set", "frozenset", "str", "bytes", "bytearray", "object"),
+    *("int", "float", "complex", "bool", "slice", "range"),
+)
+_ALLOWED = {("builtins", name) for name in _BUILTINS}
+# Python 2's names for the same, and three of its own.
+_ALLOWED |= {("__builtin__", name) for name in (*_BUILTINS, "long", "unicode", "xrange")}
 _ALLOWED |= {("collections", "OrderedDict"), ("collections", "defaultdict"), ("_codecs", "encode")}
-_ALLOWED |= {("copyreg", "_reconstructor"), ("copy_reg", "_reconstructor"), ("builtins", "object")}
-_ALLOWED |= {("__builtin__", "object")}
+_ALLOWED |= {("copyreg", "_reconstructor"), ("copy_reg", "_reconstructor")}
 for _module in _NUMPY_MODULES:
     _ALLOWED |= {
         (_module, "ndarray"),
@@ -117,7 +115,9 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
             return _unpickle(file)
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{os.fspath(path)}: {error}") from None
-    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # a damaged stream can make the unpickler raise anything
         raise ValueError(f"{os.fspath(path)}: not a readable pickle ({error})") from error
 
 
@@ -155,9 +155,9 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
                 entries[name.removesuffix(".npy")] = data
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{os.fspath(path)}, entry {name!r}: {error}") from None
-    except FileNotFoundError:
+    except OSError:
         raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, pickle.UnpicklingError) as error:
+    except Exception as error:  # a damaged archive or stream raises anything
         raise ValueError(
             f"{os.fspath(path)}: not a readable .npz archive (entry {name!r}: {error})"
         ) from error

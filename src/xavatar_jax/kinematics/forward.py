@@ -21,6 +21,7 @@ def forward_kinematics(
     `rotations` are relative to the parent; `joints` are rest positions in metres, where every
     joint's frame is aligned with the world.
     """
+    rotations, joints = jnp.asarray(rotations), jnp.asarray(joints)
     bottom = jnp.zeros((tree.num_joints, 1, 4), rotations.dtype).at[:, 0, 3].set(1)
     parents = np.maximum(np.asarray(tree.parents), 0)
     offsets = (joints - joints[parents]).at[0].set(joints[0])

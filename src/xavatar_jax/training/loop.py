@@ -18,7 +18,7 @@ from ..sampling import varied_frames
 from .config import FitConfig
 from .model import AvatarFields, settle_on_person
 from .objective import make_anchors
-from .pool import find_roots, label_frames, polish_roots, tabulate_for_search
+from .pool import FramePool, find_roots, label_frames, polish_roots, tabulate_for_search
 from .prefit import initial_fields
 from .progress import progress
 from .step import make_steps, with_learned
@@ -39,6 +39,12 @@ class History:
     seconds: dict[str, float] = field(default_factory=dict)
     steps_done: int = 0
     found: float = float("nan")
+
+    def lap(self, stage: str, since: float) -> float:
+        """Book the time since `since` on a stage; returns now."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - since
+        return now
 
     def record(self, step: int, terms: dict[str, float]) -> None:
         self.steps.append(step)
@@ -74,25 +80,54 @@ def fit_fields(
     check_params(body, frames.params, what="frames.params")
     history = History()
 
-    def lap(stage: str, since: float) -> float:
-        now = time.perf_counter()
-        history.seconds[stage] = history.seconds.get(stage, 0.0) + now - since
-        return now
-
     initial = initial_fields(body, config, cache=cache, verbose=verbose)
-    clock = lap("prefit", started)
+    clock = history.lap("prefit", started)
     start = settle_on_person(body, initial, betas, config)
-    clock = lap("settle", clock)
+    clock = history.lap("settle", clock)
     count = config.train_frames or len(frames)
     chosen = frames[varied_frames(frames.params, count)]
     with progress("points", len(chosen), verbose=verbose, unit="frame") as bar:
         pool = label_frames(body, chosen, config, bar=bar)
-    clock = lap("labels", clock)
+    clock = history.lap("labels", clock)
     if config.search.cached:
         with progress("roots", len(chosen), verbose=verbose, unit="frame") as bar:
             pool = find_roots(body, start.skinning, pool, config, bar=bar)
         history.found = float(pool.found.mean() / pool.points.shape[1])
-        clock = lap("roots", clock)
+        clock = history.lap("roots", clock)
+    return train_pool(
+        body,
+        start,
+        pool,
+        betas,
+        config,
+        seconds=_left(config, started),
+        verbose=verbose,
+        callback=callback,
+        history=history,
+        initial=initial,
+    )
+
+
+def train_pool(
+    body: BodyModel,
+    start: AvatarFields,
+    pool: FramePool,
+    betas: Any,
+    config: FitConfig,
+    *,
+    seconds: float | None = None,
+    verbose: bool = True,
+    callback: Callable[[int, AvatarFields, dict[str, float]], None] | None = None,
+    history: History | None = None,
+    initial: AvatarFields | None = None,
+) -> Fitted:
+    """Train fields on points that are labelled already, for `config.steps` or `seconds`.
+
+    The seconds count from the first step after compilation. `start` is what training begins
+    from; `initial`, if it differs, what the result calls its step 0.
+    """
+    history = History() if history is None else history
+    clock = time.perf_counter()
     anchors = make_anchors(body, jnp.asarray(betas), config)
     config = replace(config, points_per_step=min(config.points_per_step, pool.points.shape[1]))
     state, steps = make_steps(start, pool, anchors, config)
@@ -101,7 +136,7 @@ def fit_fields(
     for name in names:
         state, terms = jax.block_until_ready(steps[name](state, pool))
         latest.update(terms)
-    clock = lap("compile", clock)
+    clock = history.lap("compile", clock)
     per_step = config.frames_per_step * config.points_per_step
     with progress("training", config.steps, verbose=verbose, unit="step") as bar:
         k = len(names)
@@ -113,23 +148,30 @@ def fit_fields(
             k += 1
             bar.update(1)
             if "skinning" in steps and k % config.polish_every == 0:
-                fields = with_learned(start, state)
-                table = tabulate_for_search(body, fields.skinning, config)
-                pool = polish_roots(fields.skinning, table, pool)
-            if k % _REPORT_EVERY == 0 or k == config.steps:
-                values = {name: float(value) for name, value in latest.items()}
-                _check_finite(values, k)
-                history.record(k, values)
-                rate = per_step * (k - 1) / max(time.perf_counter() - clock, 1e-9)
-                bar.set_postfix(loss=f"{values['loss']:.4f}", points_s=f"{rate:,.0f}")
-                if callback is not None:
-                    callback(k, with_learned(start, state), values)
-                if config.minutes and time.perf_counter() - started > 60 * config.minutes:
-                    break
+                skinning = with_learned(start, state).skinning
+                pool = polish_roots(skinning, tabulate_for_search(body, skinning, config), pool)
+            if k % _REPORT_EVERY and k != config.steps:
+                continue
+            values = {name: float(value) for name, value in latest.items()}
+            _check_finite(values, k)
+            history.record(k, values)
+            rate = per_step * (k - len(names)) / max(time.perf_counter() - clock, 1e-9)
+            bar.set_postfix(loss=f"{values['loss']:.4f}", points_s=f"{rate:,.0f}")
+            if callback is not None:
+                callback(k, with_learned(start, state), values)
+            if seconds is not None and time.perf_counter() - clock > seconds:
+                break
     history.steps_done = k
-    lap("train", clock)
-    history.seconds["total"] = time.perf_counter() - started
-    return Fitted(initial, with_learned(start, state), history)
+    jax.block_until_ready(state.learned)
+    history.lap("train", clock)
+    return Fitted(start if initial is None else initial, with_learned(start, state), history)
+
+
+def _left(config: FitConfig, started: float) -> float | None:
+    """Seconds of the budget that are left, compilation of the step included."""
+    if config.minutes is None:
+        return None
+    return max(60 * config.minutes - (time.perf_counter() - started), 0.0)
 
 
 def subject_betas(frames: Frames) -> np.ndarray:

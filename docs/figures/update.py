@@ -1,0 +1,181 @@
+"""Keeps the measured figures and puts them into the texts, so that no figure is typed by hand.
+
+    python docs/figures/update.py                                    # write the tables again
+    python docs/figures/update.py --metrics out/fit_grab/metrics.json
+    python docs/figures/update.py --part-aware part_aware.json
+
+A result is copied into this folder without what is of no use elsewhere (paths, single frames).
+A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "docs" / "figures"
+TEXTS = ("README.md", "docs/benchmarks.md")
+METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
+REGIONS = ("all", "hands", "face")
+NOT_MEASURED = "Not measured yet for this version."
+
+_FIGURES = (
+    ("cd_mm", "Chamfer distance, mm", 2),
+    ("cd_max_mm", "maximum distance, mm", 1),
+    ("nc", "normal consistency", 3),
+    ("iou", "volumetric IoU", 3),
+    ("iou_near", "volumetric IoU near the surface", 3),
+    ("iou_box", "bounding-box IoU", 3),
+)
+_KEPT = (
+    *(name for name, _, _ in _FIGURES),
+    *("count", "before", "frames", "seconds", "stages", "preset", "seed", "steps"),
+    *("device", "cores", "peak_rss_mb", "commit", "versions"),
+)
+_SEARCH = (
+    ("search_points_per_s", "search, points/s", 0),
+    ("starts_per_point", "starts a point", 1),
+    ("steps_per_start", "solver steps a start", 1),
+    ("recall_all", "known correspondences found, all", 4),
+    ("recall_body", "the same, body", 4),
+    ("recall_face", "the same, face", 4),
+    ("recall_hands", "the same, hands", 4),
+    ("train_steps_per_s", "training, steps/s", 3),
+    ("cd_all_mm", "equal steps: Chamfer, all, mm", 2),
+    ("cd_hands_mm", "equal steps: Chamfer, hands, mm", 2),
+    ("cd_face_mm", "equal steps: Chamfer, face, mm", 2),
+    ("equal_time_steps", "equal time: steps", 0),
+    ("equal_time_cd_all_mm", "equal time: Chamfer, all, mm", 2),
+    ("equal_time_cd_hands_mm", "equal time: Chamfer, hands, mm", 2),
+)
+
+
+def slim_metrics(record: dict[str, Any]) -> dict[str, Any]:
+    """What is kept of a run's `metrics.json`."""
+    return {name: record[name] for name in _KEPT if name in record}
+
+
+def slim_benchmark(record: dict[str, Any]) -> dict[str, Any]:
+    """What is kept of a benchmark's JSON."""
+    header = {name: value for name, value in record["header"].items() if name != "platform"}
+    return {"header": header, "rows": record["rows"]}
+
+
+def accuracy_view(record: dict[str, Any]) -> str:
+    """Held-out figures after and before training, and what they were measured on."""
+    before = record["before"]
+    head = [f"{record['frames']} held-out frames"]
+    for region in REGIONS:
+        head += [f"{region}", "before"]
+    rows = [head]
+    for name, label, digits in _FIGURES:
+        row = [label]
+        for region in REGIONS:
+            row += [f"**{_number(record[name][region], digits)}**"]
+            row += [_number(before[name][region], digits)]
+        rows.append(row)
+    few = round(record["frames"] * before["count"]["all"] / record["count"]["all"])
+    return (
+        f"{_table(rows)}\n\n"
+        f"Preset `{record['preset']}`, {record['steps']} steps, seed {record['seed']}, "
+        f"{_machine(record)}: {record['seconds']['total']:.0f} s in all, "
+        f"{record['peak_rss_mb'] / 1024:.1f} GiB of memory at most. "
+        f"*Before* is the start, the body's mean shape on the person's skeleton, "
+        f"on {few} of the frames."
+    )
+
+
+def stages_view(record: dict[str, Any]) -> str:
+    """Seconds by stage."""
+    rows = [["stage", "seconds"]]
+    rows += [[name, f"{value:.0f}"] for name, value in record["seconds"].items()]
+    return f"{_table(rows)}\n\n{_sentence(_machine(record))}."
+
+
+def benchmark_view(record: dict[str, Any]) -> str:
+    """One column a start set."""
+    columns = record["rows"]
+    rows = [["", *(column["starts"] for column in columns)]]
+    for name, label, digits in _SEARCH:
+        rows.append([label, *(_number(column[name], digits) for column in columns)])
+    header = record["header"]
+    size = "quick" if header["quick"] else "full"
+    return (
+        f"{_table(rows)}\n\n{_sentence(_machine(header))}; {size} run, seed {header['seed']}, "
+        f"{header['points_per_step']} points a training step; equal time is "
+        f"{header['equal_time_s']:.0f} s of training."
+    )
+
+
+VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
+    f"docs/figures/{METRICS}": accuracy_view,
+    f"docs/figures/{METRICS} stages": stages_view,
+    f"docs/figures/{PART_AWARE}": benchmark_view,
+}
+_BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
+
+
+def filled(text: str) -> str:
+    """The text with every table written anew.
+
+    **Raises:** `KeyError` for a block that no view knows.
+    """
+
+    def write(match: re.Match[str]) -> str:
+        view = VIEWS[match[2]]
+        file = ROOT / match[2].split()[0]
+        body = view(json.loads(file.read_text("utf-8"))) if file.exists() else NOT_MEASURED
+        return f"{match[1]}{body}\n{match[3]}"
+
+    return _BLOCK.sub(write, text)
+
+
+def _table(rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    rule = "|---|" + "---:|" * (len(rows[0]) - 1)
+    return "\n".join([lines[0], rule, *lines[1:]])
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "not measured" if value is None else f"{value:.{digits}f}"
+
+
+def _machine(record: dict[str, Any]) -> str:
+    platform, _, kind = record["device"].partition(": ")
+    place = f"{record['cores']} CPU cores" if platform == "cpu" else kind
+    versions = record["versions"]
+    return f"{place}, Python {versions['python']}, JAX {versions['jax']}"
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _store(source: str, name: str, slim: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    record = slim(json.loads(Path(source).read_text("utf-8")))
+    text = json.dumps(record, indent=2, allow_nan=False)
+    (FOLDER / name).write_text(text + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
+    parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
+    args = parser.parse_args()
+    if args.metrics:
+        _store(args.metrics, METRICS, slim_metrics)
+    if args.part_aware:
+        _store(args.part_aware, PART_AWARE, slim_benchmark)
+    for name in TEXTS:
+        path = ROOT / name
+        path.write_text(filled(path.read_text("utf-8")), encoding="utf-8")
+        print(f"written: {name}")
+
+
+if __name__ == "__main__":
+    main()

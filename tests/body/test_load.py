@@ -1,0 +1,286 @@
+"""Model files of every kind and layout, and what is said about those that are wrong."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+from helpers import COLUMNS, PARENTS, toy_arrays
+
+from xavatar_jax.body import load_body
+from xavatar_jax.files import UnsafePickleError
+
+
+def write_npz(path, arrays):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **arrays)
+    return path
+
+
+@pytest.fixture
+def smplx():
+    return toy_arrays(PARENTS["smplx"], columns=40, num_vertices=70)
+
+
+@pytest.fixture
+def chumpy_array(monkeypatch):
+    """Wraps an array as chumpy pickles it."""
+    module = types.ModuleType("chumpy.ch")
+
+    class Ch:
+        def __init__(self, x):
+            self.x = x
+
+    Ch.__module__, Ch.__qualname__ = "chumpy.ch", "Ch"
+    module.Ch = Ch
+    monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
+    monkeypatch.setitem(sys.modules, "chumpy.ch", module)
+    return Ch
+
+
+def assert_holds(body, arrays):
+    for found, key in (
+        (body.template, "v_template"),
+        (body.pose_dirs, "posedirs"),
+        (body.weights, "weights"),
+        (body.joint_regressor, "J_regressor"),
+        (body.faces, "f"),
+    ):
+        np.testing.assert_allclose(found, arrays[key], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", PARENTS)
+@pytest.mark.parametrize("suffix", ["npz", "pkl"])
+def test_each_kind_from_each_format(tmp_path, chumpy_array, kind, suffix):
+    arrays = toy_arrays(PARENTS[kind], columns=COLUMNS[kind])
+    path = tmp_path / f"{kind.upper()}_FEMALE.{suffix}"
+    if suffix == "npz":
+        write_npz(path, arrays)
+    else:  # as Python 2 wrote them: a sparse regressor, chumpy arrays, an unsigned root parent
+        stored = {
+            **arrays,
+            "J_regressor": scipy.sparse.csc_matrix(arrays["J_regressor"]),
+            "shapedirs": chumpy_array(arrays["shapedirs"]),
+            "posedirs": chumpy_array(arrays["posedirs"]),
+            "kintree_table": np.where(
+                arrays["kintree_table"] < 0, 2**32 - 1, arrays["kintree_table"]
+            ),
+            "bs_type": "lrotmin",
+        }
+        path.write_bytes(pickle.dumps(stored, 2))
+    body = load_body(path)
+    assert_holds(body, arrays)
+    assert body.kind == kind
+    assert body.source.gender == "female"
+    assert body.source.path == str(path)
+    assert len(body.source.checksum) == 64
+    assert body.tree.parents == PARENTS[kind]
+    columns = np.concatenate([body.shape_dirs, body.expression_dirs], axis=-1)
+    np.testing.assert_allclose(columns, arrays["shapedirs"], rtol=1e-6)
+    joints = arrays["J_regressor"] @ arrays["v_template"]
+    np.testing.assert_allclose(body.joint_template, joints, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("columns", "betas", "expression"), [(400, 300, 100), (20, 10, 10), (10, 10, 0)]
+)
+def test_shape_and_expression_columns_of_smplx(tmp_path, columns, betas, expression):
+    arrays = toy_arrays(PARENTS["smplx"], columns=columns)
+    body = load_body(write_npz(tmp_path / "a.npz", arrays))
+    assert (body.num_betas, body.num_expression) == (betas, expression)
+    np.testing.assert_allclose(body.shape_dirs, arrays["shapedirs"][..., :betas], rtol=1e-6)
+    np.testing.assert_allclose(body.expression_dirs, arrays["shapedirs"][..., betas:], rtol=1e-6)
+
+
+def test_fewer_coefficients(tmp_path):
+    arrays = toy_arrays(PARENTS["smplx"], columns=400)
+    path = write_npz(tmp_path / "a.npz", arrays)
+    body = load_body(path, num_betas=16, num_expression=50)
+    np.testing.assert_allclose(body.shape_dirs, arrays["shapedirs"][..., :16], rtol=1e-6)
+    np.testing.assert_allclose(body.expression_dirs, arrays["shapedirs"][..., 300:350], rtol=1e-6)
+    with pytest.raises(ValueError, match=r"a\.npz: num_betas=301, but the file has 300"):
+        load_body(path, num_betas=301)
+    with pytest.raises(ValueError, match=r"a\.npz: num_expression=101, but the file has 100"):
+        load_body(path, num_expression=101)
+
+
+def test_precision_follows_the_setting(tmp_path, smplx, x64):
+    body = load_body(write_npz(tmp_path / "a.npz", smplx))
+    assert body.template.dtype == jnp.float64
+    np.testing.assert_array_equal(body.template, smplx["v_template"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "gender", "place"),
+    [
+        ("smplx", "neutral", "smplx/SMPLX_NEUTRAL.npz"),
+        ("smplx", "male", "smplx/SMPLX_MALE.pkl"),
+        ("smpl", "female", "smpl/SMPL_FEMALE.pkl"),
+        ("smplh", "male", "smplh/SMPLH_MALE.npz"),
+        ("mano", "right", "mano/MANO_RIGHT.pkl"),
+        ("smplx", "neutral", "SMPLX_NEUTRAL.npz"),
+    ],
+)
+def test_folder_layout(tmp_path, monkeypatch, kind, gender, place):
+    arrays = toy_arrays(PARENTS[kind], columns=COLUMNS[kind])
+    path = tmp_path / "models" / place
+    path.parent.mkdir(parents=True)
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        path.write_bytes(pickle.dumps(arrays, 2))
+    body = load_body(tmp_path / "models", kind=kind, gender=gender)
+    assert body.source.path == str(path)
+    assert body.kind == kind
+    if kind != "mano":
+        assert body.source.gender == gender
+    monkeypatch.setenv("SMPLX_MODEL_DIR", str(tmp_path / "models"))
+    assert load_body(kind=kind, gender=gender).source.path == str(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "site"), [("smplx", "smpl-x.is.tue.mpg.de"), ("mano", "mano.is.tue.mpg.de"),
+                       ("smpl", "smpl.is.tue.mpg.de")],
+)  # fmt: skip
+def test_a_missing_model_lists_what_was_tried_and_where_to_get_it(tmp_path, kind, site):
+    with pytest.raises(FileNotFoundError) as error:
+        load_body(tmp_path, kind=kind, gender="male")
+    name = f"{kind.upper()}_MALE"
+    for tried in (tmp_path / kind / f"{name}.npz", tmp_path / kind / f"{name}.pkl",
+                  tmp_path / f"{name}.npz", tmp_path / f"{name}.pkl"):  # fmt: skip
+        assert str(tried) in str(error.value)
+    assert site in str(error.value)
+    assert "synthetic_body" in str(error.value)
+
+
+def test_a_missing_file(tmp_path, monkeypatch):
+    with pytest.raises(FileNotFoundError, match=r"Tried:\n  .*none\.npz"):
+        load_body(tmp_path / "none.npz")
+    monkeypatch.delenv("SMPLX_MODEL_DIR", raising=False)
+    with pytest.raises(FileNotFoundError, match="SMPLX_MODEL_DIR"):
+        load_body()
+
+
+@pytest.mark.parametrize(
+    ("key", "shape", "expected"),
+    [
+        ("v_template", (70, 2), r"\('n', 3\)"),
+        ("v_template", (71, 3), r"weights has shape \(70, 55\), expected \(71, 55\)"),
+        ("f", (140,), r"\('n', 3\)"),
+        ("f", (140, 4), r"\('n', 3\)"),
+        ("kintree_table", (55,), r"\(2, 'n'\)"),
+        ("weights", (70, 54), r"\(70, 55\)"),
+        ("J_regressor", (54, 70), r"\(55, 70\)"),
+        ("posedirs", (70, 3, 207), r"\(70, 3, 486\)"),
+        ("shapedirs", (69, 3, 40), r"\(70, 3, 'n'\)"),
+        ("shapedirs", (70, 120), r"\(70, 3, 'n'\)"),
+        ("hands_meanl", (44,), r"\(45,\)"),
+        ("hands_componentsr", (6, 44), r"\('n', 45\)"),
+        ("part_labels", (69,), r"\(70,\)"),
+        ("vertex_colors", (70, 4), r"\(70, 3\)"),
+    ],
+)
+def test_a_wrong_shape_names_file_entry_and_both_shapes(tmp_path, smplx, key, shape, expected):
+    path = write_npz(tmp_path / "broken.npz", {**smplx, key: np.zeros(shape)})
+    with pytest.raises(ValueError, match=expected) as error:
+        load_body(path)
+    assert str(path) in str(error.value)
+    assert key in str(error.value) or "weights" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "key", ["v_template", "f", "kintree_table", "weights", "J_regressor", "posedirs", "shapedirs"]
+)
+def test_a_missing_entry_lists_those_there_are(tmp_path, smplx, key):
+    path = write_npz(tmp_path / "a.npz", {k: v for k, v in smplx.items() if k != key})
+    with pytest.raises(ValueError, match=rf"a\.npz: no entry '{key}'; the file has"):
+        load_body(path)
+
+
+@pytest.mark.parametrize("key", ["v_template", "weights", "J_regressor", "posedirs", "shapedirs"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_entries_that_are_not_finite(tmp_path, smplx, key, value):
+    smplx[key].flat[5] = value
+    path = write_npz(tmp_path / "a.npz", smplx)
+    with pytest.raises(ValueError, match=rf"a\.npz: {key} has entries that are not finite"):
+        load_body(path)
+
+
+def test_faces_labels_and_trees_out_of_range(tmp_path, smplx):
+    faces = smplx["f"].copy()
+    faces[3, 1] = 70
+    path = write_npz(tmp_path / "a.npz", {**smplx, "f": faces})
+    with pytest.raises(ValueError, match=r"a\.npz: f refers to vertex 70"):
+        load_body(path)
+    path = write_npz(tmp_path / "b.npz", {**smplx, "part_labels": np.full(70, 5)})
+    with pytest.raises(ValueError, match=r"b\.npz: part_labels must be 0 to 4"):
+        load_body(path)
+    table = smplx["kintree_table"].copy()
+    table[0, 10] = 30
+    path = write_npz(tmp_path / "c.npz", {**smplx, "kintree_table": table})
+    with pytest.raises(ValueError, match=r"c\.npz: kintree_table: joint 10 .* has parent 30"):
+        load_body(path)
+
+
+def test_labels_and_colours_of_the_file(tmp_path, smplx, rng):
+    labels, colors = rng.integers(0, 5, 70), rng.integers(0, 255, (70, 3)).astype(np.uint8)
+    path = write_npz(tmp_path / "a.npz", {**smplx, "part_labels": labels, "vertex_colors": colors})
+    body = load_body(path)
+    np.testing.assert_array_equal(body.part_labels, labels)
+    np.testing.assert_array_equal(body.colors, colors)
+
+
+def test_other_kinds_of_file(tmp_path):
+    for name in ("model.obj", "model"):
+        (tmp_path / name).write_text("v 0 0 0")
+        with pytest.raises(ValueError, match=r"an \.npz or \.pkl file"):
+            load_body(tmp_path / name)
+    (tmp_path / "list.pkl").write_bytes(pickle.dumps([1, 2], 2))
+    with pytest.raises(ValueError, match=r"list\.pkl: expected a dictionary of arrays, found list"):
+        load_body(tmp_path / "list.pkl")
+    (tmp_path / "text.npz").write_text("not an archive")
+    with pytest.raises(ValueError, match=r"text\.npz: not a readable"):
+        load_body(tmp_path / "text.npz")
+
+
+class Attack:
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.marker}",)
+
+
+@pytest.mark.parametrize("suffix", ["pkl", "npz"])
+def test_a_malicious_model_is_refused(tmp_path, smplx, suffix):
+    marker, path = tmp_path / "ran", tmp_path / f"model.{suffix}"
+    if suffix == "pkl":
+        path.write_bytes(pickle.dumps({**smplx, "v_template": Attack(marker)}, 2))
+    else:
+        write_npz(path, {**smplx, "joint2num": np.array({"a": Attack(marker)}, dtype=object)})
+    with pytest.raises(UnsafePickleError, match=rf"model\.{suffix}"):
+        load_body(path)
+    assert not marker.exists()
+
+
+def test_names_of_another_tree(tmp_path):
+    parents, names = (-1, 0, 0), ("base", "up", "down")
+    named = toy_arrays(parents, names=names)
+    assert load_body(write_npz(tmp_path / "a.npz", named)).tree.names == names
+    unnamed = toy_arrays(parents)
+    body = load_body(write_npz(tmp_path / "b.npz", unnamed))
+    assert body.tree.names == ("joint0", "joint1", "joint2")
+    assert not np.asarray(body.part_labels).any()
+
+
+def test_the_side_of_a_mano_hand(tmp_path):
+    arrays = toy_arrays(PARENTS["mano"])
+    for side in ("left", "right"):
+        body = load_body(write_npz(tmp_path / f"MANO_{side.upper()}.npz", arrays))
+        assert body.tree.names[0] == f"{side}_wrist"

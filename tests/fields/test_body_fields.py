@@ -1,0 +1,159 @@
+"""Fields made for a body: the template's weights on grids, and the local geometry field."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from xavatar_jax.body import BodyParams, canonical_joints
+from xavatar_jax.fields import (
+    GridSpacing,
+    HashGeometry,
+    body_part_grids,
+    mean_canonical_vertices,
+    template_grid_skinning,
+    template_weights,
+)
+
+COARSE = GridSpacing(body=0.04, hands=0.013, face=0.02, band=0.08, fine_band=0.03)
+
+
+@pytest.fixture(scope="module")
+def vertices(bundled_body):
+    return mean_canonical_vertices(bundled_body)
+
+
+@pytest.fixture(scope="module")
+def skinning(bundled_body, vertices):
+    return template_grid_skinning(bundled_body, vertices, COARSE, COARSE, smoothing_steps=2)
+
+
+def test_weights_at_the_vertices_are_their_own(bundled_body, vertices, rng):
+    pick = rng.integers(0, len(vertices), 300)
+    found = template_weights(bundled_body, vertices, vertices[pick])
+    np.testing.assert_allclose(found, bundled_body.weights[pick], atol=1e-4)
+    np.testing.assert_allclose(found.sum(1), 1.0, atol=1e-5)
+
+
+def test_weights_off_the_surface_are_those_of_the_nearest(bundled_body, vertices, rng):
+    points = vertices[rng.integers(0, len(vertices), 300)] + 0.01 * rng.normal(size=(300, 3))
+    found = template_weights(bundled_body, vertices, points)
+    _, nearest = cKDTree(vertices).query(points)
+    close = np.abs(found - np.asarray(bundled_body.weights)[nearest]).max(1)
+    assert np.median(close) < 0.02  # a vertex spacing away at most
+
+
+def test_grids_around_the_body(bundled_body, vertices, rng):
+    grids = body_part_grids(bundled_body, vertices, COARSE)
+    assert grids.spacing.shape == (4,)
+    assert bool(grids.covers(jnp.asarray(vertices, jnp.float32)).all())
+
+
+def test_template_skinning_near_the_surface(bundled_body, vertices, skinning, rng):
+    pick = rng.integers(0, len(vertices), 400)
+    points = jnp.asarray(vertices[pick], jnp.float32)
+    found = np.asarray(jax.jit(jax.vmap(skinning))(points))
+    np.testing.assert_allclose(found.sum(1), 1.0, atol=1e-5)
+    assert np.abs(found - np.asarray(bundled_body.weights)[pick]).max(1).mean() < 0.1
+    assert bool(jax.vmap(skinning.covers)(points).all())
+    assert not bool(skinning.covers(jnp.array([0.0, 5.0, 0.0])))
+
+
+def test_the_correction_learns_and_the_template_does_not(skinning, vertices):
+    points = jnp.asarray(vertices[:40], jnp.float32)
+    slope = eqx.filter_grad(lambda f: jnp.sum(jax.vmap(f)(points)[:, 15] ** 2))(skinning)
+    assert not np.asarray(slope.template).any()
+    assert np.isfinite(slope.correction).all()
+
+
+@pytest.fixture(scope="module")
+def geometry(bundled_body, vertices):
+    joints = np.asarray(canonical_joints(bundled_body, jnp.zeros(0)), np.float64)
+    hand = np.asarray(bundled_body.part_labels) == 2
+    box = (vertices[hand].min(0) - 0.02, vertices[hand].max(0) + 0.02, 0.01)
+    return HashGeometry(
+        bundled_body.tree, joints, 10, vertices.min(0) - 0.1, vertices.max(0) + 0.1,
+        spacing=(0.1, 0.05, 0.02, 0.01), trunk_spacing=0.02, detail=(box,), features=2,
+        log2_size=10, width=16, condition_width=6, sharpness=50.0, key=jax.random.key(0),
+    )  # fmt: skip
+
+
+def params_of(body, **poses):
+    return BodyParams.create(body, **poses)
+
+
+def test_the_start_is_the_same_in_every_pose(bundled_body, vertices, geometry, rng):
+    points = jnp.asarray(vertices[::400], jnp.float32)
+    run = jax.jit(jax.vmap(geometry, in_axes=(0, None)))
+    zero = run(points, geometry.condition(BodyParams.zeros(bundled_body)))
+    params = BodyParams.create(
+        bundled_body, pose=rng.normal(size=(55, 3)), expression=rng.normal(size=10)
+    )
+    np.testing.assert_array_equal(run(points, geometry.condition(params)), zero)
+
+
+def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, geometry, rng):
+    loud = eqx.tree_at(
+        lambda g: (g.pose_weights, g.expression_weights),
+        geometry,
+        tuple(
+            jnp.asarray(rng.normal(size=w.shape), jnp.float32)
+            for w in (geometry.pose_weights, geometry.expression_weights)
+        ),
+    )
+    run = jax.jit(jax.vmap(loud, in_axes=(0, None)))
+    joints, names = np.asarray(loud.joints), bundled_body.tree
+    # Between nodes of the finest level a joint need not be inside: it is only a place to ask.
+    zero = run(loud.joints, loud.condition(BodyParams.zeros(bundled_body)))
+
+    def change(params):
+        return np.abs(run(loud.joints, loud.condition(params)) - zero)
+
+    turned = change(params_of(bundled_body, global_orient=[0.3, 2.0, 0.1]))
+    assert not turned.any()
+    jaw = change(params_of(bundled_body, jaw_pose=[0.5, 0, 0]))
+    assert jaw[names.index("jaw")] > 1e-4
+    assert jaw[names.index("left_knee")] == 0
+    assert jaw[names.index("left_index1")] == 0
+    expression = change(params_of(bundled_body, expression=rng.normal(size=10)))
+    assert expression[names.index("head")] > 1e-4
+    assert expression[names.index("left_foot")] == 0
+    elbow = np.zeros((55, 3))
+    elbow[names.index("left_elbow"), 1] = 1.0
+    elbow = change(params_of(bundled_body, pose=elbow))
+    reach = loud.reach[names.index("left_elbow")]
+    away = np.linalg.norm(joints - joints[names.index("left_elbow")], axis=1)
+    assert elbow[names.index("left_elbow")] > 1e-4
+    assert elbow[away > 6 * reach].max() < 1e-6
+
+
+def test_fine_levels_are_heard_inside_their_boxes_alone(geometry):
+    low, high = (np.asarray(b) for b in (geometry.detail_low[0], geometry.detail_high[0]))
+    levels = geometry.encoding.spacing
+    middle = geometry._level_mask(jnp.asarray((low + high) / 2, jnp.float32))
+    np.testing.assert_allclose(middle, np.ones(len(levels)), atol=1e-6)
+    outside = geometry._level_mask(jnp.asarray(high + 0.01, jnp.float32))
+    np.testing.assert_array_equal(outside, [1, 1, 1, 0])
+    border = geometry._level_mask(jnp.asarray([low[0] + 0.01, *((low + high) / 2)[1:]], jnp.float32))
+    np.testing.assert_allclose(border, [1, 1, 1, 0.5], atol=1e-4)
+
+
+def test_geometry_gradients_reach_every_part(bundled_body, vertices, geometry, rng):
+    params = BodyParams.create(
+        bundled_body, pose=0.3 * rng.normal(size=(55, 3)), expression=rng.normal(size=10)
+    )
+    points = jnp.asarray(vertices[::400], jnp.float32)
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def slope(field):
+        return jnp.sum(jax.vmap(field, in_axes=(0, None))(points, field.condition(params)) ** 2)
+
+    gradient = slope(geometry)
+    for part in (gradient.encoding.table, gradient.pose_weights, gradient.expression_weights):
+        assert np.isfinite(part).all()
+        assert np.abs(part).max() > 0
