@@ -66,9 +66,7 @@ def known_points(
     labels = np.asarray(body.part_labels)
     canonical = np.asarray(canonical_vertices(body, jnp.asarray(avatar.betas)))
     shares = (((BODY,), 0.5), (FACES, 1 / 6), (HANDS, 1 / 3))
-    pose = eqx.filter_jit(
-        lambda field, x, b: jax.vmap(lambda p: skin_points(p, field(p), b))(x)
-    )
+    pose = eqx.filter_jit(lambda field, x, b: jax.vmap(lambda p: skin_points(p, field(p), b))(x))
     cases = []
     for frame in frames:
         rows = np.concatenate(
@@ -144,7 +142,7 @@ def measure_training(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Part-aware against all-bone starts.")
     parser.add_argument("--quick", action="store_true", help="small: ends within five minutes")
     parser.add_argument("--json", help="write header and rows to this file")
     parser.add_argument("--seed", type=int, default=0)
@@ -169,9 +167,7 @@ def main() -> None:
     # Equal time: what the part-aware run took, given to all.
     seconds = (rows[0]["steps"] - 1) / rows[0]["train_steps_per_s"]
     for starts, row in zip(STARTS, rows, strict=True):
-        timed = measure_training(
-            start, pool, capture, betas, config, starts, eval_frames, seconds
-        )
+        timed = measure_training(start, pool, capture, betas, config, starts, eval_frames, seconds)
         row |= {f"equal_time_{k}": timed[k] for k in ("steps", "cd_all_mm", "cd_hands_mm")}
     header = {
         "question": "part-aware against all-bone and body-only starts",

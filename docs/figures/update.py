@@ -5,7 +5,8 @@
     python docs/figures/update.py --part-aware part_aware.json
 
 A result is copied into this folder without what is of no use elsewhere (paths, single frames).
-A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`.
+A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`; the table
+of presets comes from the library itself.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ import argparse
 import json
 import re
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "figures"
-TEXTS = ("README.md", "docs/benchmarks.md")
+TEXTS = ("README.md", "docs/benchmarks.md", "docs/options.md")
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
@@ -36,6 +38,28 @@ _KEPT = (
     *(name for name, _, _ in _FIGURES),
     *("count", "before", "frames", "seconds", "stages", "preset", "seed", "steps"),
     *("device", "cores", "peak_rss_mb", "commit", "versions"),
+)
+_ENTRIES = (
+    ("steps", "{}"),
+    ("train_frames", "{} (0: all)"),
+    ("frames_per_step", "{}"),
+    ("points_per_step", "{}, of each frame"),
+    ("points.total", "{}, drawn of each frame"),
+    ("skinning.kind", "{}"),
+    ("geometry.kind", "{}"),
+    ("search.starts", "{}"),
+    ("search.cached", "{}"),
+    ("search.keep", "{}, roots a point"),
+    ("losses.softness", "{}, metres"),
+    ("losses.bone", "{}"),
+    ("losses.joint", "{}"),
+    ("losses.surface", "{}"),
+    ("losses.surface_parts", "{}"),
+    ("optimiser.learning_rate", "{}"),
+    ("optimiser.skinning_rate", "{}"),
+    ("optimiser.schedule", "{}"),
+    ("optimiser.clip", "{}"),
+    ("prefit_steps", "{}"),
 )
 _SEARCH = (
     ("search_points_per_s", "search, points/s", 0),
@@ -112,6 +136,17 @@ def benchmark_view(record: dict[str, Any]) -> str:
     )
 
 
+def presets_view() -> str:
+    """Entries of the two presets, side by side."""
+    import xavatar_jax as xa
+
+    rows = [["entry", "`quick`", "`paper`"]]
+    for entry, label in _ENTRIES:
+        values = [attrgetter(entry)(config) for config in (xa.quick(), xa.paper())]
+        rows.append([label.format(f"`{entry}`"), *map(str, values)])
+    return _table(rows)
+
+
 VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{METRICS}": accuracy_view,
     f"docs/figures/{METRICS} stages": stages_view,
@@ -127,12 +162,16 @@ def filled(text: str) -> str:
     """
 
     def write(match: re.Match[str]) -> str:
-        view = VIEWS[match[2]]
-        file = ROOT / match[2].split()[0]
-        body = view(json.loads(file.read_text("utf-8"))) if file.exists() else NOT_MEASURED
-        return f"{match[1]}{body}\n{match[3]}"
+        return f"{match[1]}{_body(match[2])}\n{match[3]}"
 
     return _BLOCK.sub(write, text)
+
+
+def _body(name: str) -> str:
+    if name == "presets":
+        return presets_view()
+    view, file = VIEWS[name], ROOT / name.split()[0]
+    return view(json.loads(file.read_text("utf-8"))) if file.exists() else NOT_MEASURED
 
 
 def _table(rows: list[list[str]]) -> str:

@@ -84,7 +84,7 @@ class Avatar:
             self._table,
             self.body,
             points,
-            self._parts_of(points, params),
+            jnp.asarray(self._parts_of(points, params)),
             self._own(params),
             starts,
         )
@@ -190,9 +190,7 @@ class Avatar:
         _, nearest = nearest_vertices(template, np.asarray(jax.lax.stop_gradient(points)))
         return np.asarray(self.body.part_labels)[nearest].astype(np.int32)
 
-    def _extract_canonical(
-        self, cell: CellSizes | float | None, max_vertices: int | None
-    ) -> Mesh:
+    def _extract_canonical(self, cell: CellSizes | float | None, max_vertices: int | None) -> Mesh:
         neutral = canonical_params(self.body, jnp.asarray(self.betas))
         condition = self.fields.geometry.condition(neutral)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from ..body import BodyModel
 from ..frames import Frames
@@ -27,7 +28,7 @@ class Fit:
     history: History
     before: Avatar
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Any]:
         return iter((self.avatar, self.history))
 
 
@@ -57,5 +58,3 @@ def fit(
     )
     avatar = Avatar(body, betas, fitted.fields, config, fitted.history.steps_done)
     return Fit(avatar, fitted.history, Avatar(body, betas, fitted.initial, config, 0))
-
-

@@ -45,9 +45,7 @@ def query_posed(
     transforms = bone_transforms(body, params)
     condition = fields.geometry.condition(params)
     bones, mask = (jnp.asarray(v) for v in start_table(body.tree, starts))
-    fixed_points, fixed_transforms, fixed_table = jax.lax.stop_gradient(
-        (points, transforms, table)
-    )
+    fixed_points, fixed_transforms, fixed_table = jax.lax.stop_gradient((points, transforms, table))
     roots = search_grid(
         pose_grid(fixed_table, fixed_transforms),
         fixed_points,

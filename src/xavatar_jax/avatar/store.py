@@ -8,8 +8,6 @@ from typing import Any
 
 import equinox as eqx
 
-
-
 from .._version import __version__
 from ..body import BodyModel, load_body, synthetic_body
 from ..fields import HashGeometry
@@ -108,5 +106,3 @@ def _find_body(path: str | os.PathLike[str], known: dict[str, Any]) -> BodyModel
         f"{os.fspath(path)}: its body model is not at {file} any more. Pass the {known['kind']} "
         f"({known['gender']}) model it was learned on: load_avatar(path, body=load_body(...))"
     )
-
-

@@ -169,9 +169,7 @@ def _build(
     )
 
 
-def _array(
-    file: Path, data: dict[str, Any], key: str, shape: tuple[int | None, ...]
-) -> np.ndarray:
+def _array(file: Path, data: dict[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     if data.get(key) is None:
         present = ", ".join(sorted(map(str, data)))
         raise ValueError(f"{file}: no entry {key!r}; the file has {present}")

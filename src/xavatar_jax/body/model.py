@@ -20,7 +20,7 @@ from ..kinematics import (
 )
 from .params import BodyParams
 
-# Posing is geometry: a tensor-core product with 10-bit mantissas would move vertices by millimetres.
+# Posing is geometry: products with ten-bit mantissas would move vertices by millimetres.
 _PRECISION = jax.lax.Precision.HIGHEST
 
 

@@ -189,8 +189,10 @@ def check_params(body: Any, params: BodyParams, *, what: str = "params") -> None
 
 def _joints(name: str, value: Any, count: int) -> Array:
     array = jnp.asarray(value, dtype=float)
-    if array.ndim >= 1 and array.shape[-1] == 3 * count and not (
-        array.ndim >= 2 and array.shape[-2:] == (count, 3)
+    if (
+        array.ndim >= 1
+        and array.shape[-1] == 3 * count
+        and not (array.ndim >= 2 and array.shape[-2:] == (count, 3))
     ):
         array = array.reshape(*array.shape[:-1], count, 3)
     if array.ndim < 2 or array.shape[-2:] != (count, 3):

@@ -17,6 +17,8 @@ from .lanes import solve_lanes
 from .newton import ClosedFormNewton
 from .plain import DIVERGENCE, pull_back
 
+GRID_SOLVER = ClosedFormNewton(atol=1e-5, divergence=DIVERGENCE)
+FIELD_SOLVER = Broyden(atol=1e-5, divergence=DIVERGENCE)
 # Roots closer than this are one root found twice: ten times the search's tolerance and more.
 SAME_ROOT = 5e-4
 
@@ -48,7 +50,7 @@ def search_grid(
     bones: Int[Array, "parts I"],
     mask: Bool[Array, "parts I"],
     *,
-    solver: optx.AbstractRootFinder = ClosedFormNewton(atol=1e-5, divergence=DIVERGENCE),
+    solver: optx.AbstractRootFinder = GRID_SOLVER,
     keep: int = 3,
     max_steps: int = 15,
     width: int = 4096,
@@ -79,7 +81,7 @@ def search_field(
     bones: Int[Array, "parts I"],
     mask: Bool[Array, "parts I"],
     *,
-    solver: Broyden = Broyden(atol=1e-5, divergence=DIVERGENCE),
+    solver: Broyden = FIELD_SOLVER,
     keep: int = 3,
     max_steps: int = 50,
     width: int = 2048,

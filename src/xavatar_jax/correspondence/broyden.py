@@ -61,7 +61,7 @@ class Broyden(optx.AbstractRootFinder):
         residual = flat_fn(flat_y)
         if residual.shape != flat_y.shape:
             raise ValueError(
-                f"Broyden needs as many equations as unknowns: {residual.size} against {flat_y.size}"
+                f"Broyden needs as many equations as unknowns: {residual.size} for {flat_y.size}"
             )
         inverse = options.get("inverse_jacobian")
         if inverse is None:

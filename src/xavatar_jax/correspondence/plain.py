@@ -108,9 +108,7 @@ def find_correspondences(
     return Correspondences(*jax.vmap(solve)(starts))
 
 
-def pull_back(
-    x_d: Float[Array, "3"], transforms: Float[Array, "I 4 4"]
-) -> Float[Array, "I 3"]:
+def pull_back(x_d: Float[Array, "3"], transforms: Float[Array, "I 4 4"]) -> Float[Array, "I 3"]:
     """$B_i^{-1} x_d$ for each bone: where a point would be if it belonged to that bone alone."""
     linear = transforms[..., :3, :3]
     return (inverse_3x3(linear) * (x_d - transforms[..., :3, 3])[..., None, :]).sum(-1)

@@ -93,5 +93,3 @@ def check_bones(bones: tuple[int, ...], num_joints: int, *, what: str = "init_bo
     wrong = [b for b in bones if not 0 <= int(b) < num_joints]
     if wrong:
         raise ValueError(f"{what}: bone {wrong[0]} is out of range for {num_joints} joints")
-
-

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from xavatar_jax.body import BodyModel, BodyParams
-from xavatar_jax.frames import Frames
+from ..body import BodyModel, BodyParams
+from ..frames import Frames
 
 NUM_TRAIN, NUM_TEST = 9, 3  # sequences, as in X-Avatar's experiments on GRAB
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.body import BodyModel
-from xavatar_jax.datasets.capture import Capture, notify, resolve_gender, split_names
-from xavatar_jax.datasets.mesh_frames import check_first_frame, mesh_frames, read_params
-from xavatar_jax.frames import Frames
+from ..body import BodyModel
+from ..frames import Frames
+from .capture import Capture, notify, resolve_gender, split_names
+from .mesh_frames import check_first_frame, mesh_frames, read_params
 
 _MESHES, _PARAMS = (".ply", ".obj"), (".npz", ".pkl")
 _TEST_FRACTION = 0.25

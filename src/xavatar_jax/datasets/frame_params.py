@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from xavatar_jax.body import BodyModel, BodyParams, hands_to_absolute, pose_groups
-from xavatar_jax.files import load_npz, load_pickle
+from ..body import BodyModel, BodyParams, hands_to_absolute, pose_groups
+from ..files import load_npz, load_pickle
 
 _ALIASES = {
     "global_orient": ("global_orient", "root_orient"),

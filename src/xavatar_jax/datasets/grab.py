@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.body import BodyModel, BodyParams, with_template
-from xavatar_jax.datasets.capture import (
+from ..body import BodyModel, BodyParams, with_template
+from ..files.meshes import read_mesh
+from ..frames import Frames, frames_from_params
+from ..motion import Motion, fit_to_body, load_motion
+from .capture import (
     Capture,
     concatenate_params,
     notify,
@@ -18,10 +21,7 @@ from xavatar_jax.datasets.capture import (
     resolve_gender,
     split_names,
 )
-from xavatar_jax.datasets.prepared import find_subject, load_prepared
-from xavatar_jax.files.meshes import read_mesh
-from xavatar_jax.frames import Frames, frames_from_params
-from xavatar_jax.motion import Motion, fit_to_body, load_motion
+from .prepared import find_subject, load_prepared
 
 # AMASS keeps a subject's shape fit beside its motions.
 _NOT_MOTIONS = ("_stagei.npz", "shape.npz")

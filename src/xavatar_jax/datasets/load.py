@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from xavatar_jax.body import BodyModel
-from xavatar_jax.datasets.capture import Capture
-from xavatar_jax.datasets.folder import find_frames, load_folder
-from xavatar_jax.datasets.grab import find_motions, load_grab
-from xavatar_jax.datasets.prepared import find_subject, load_prepared
-from xavatar_jax.motion import load_motion
+from ..body import BodyModel
+from ..motion import load_motion
+from .capture import Capture
+from .folder import find_frames, load_folder
+from .grab import find_motions, load_grab
+from .prepared import find_subject, load_prepared
 
 _LAYOUTS = (
     "train/*.npz and test/*.npz (AMASS or GRAB sequences)",

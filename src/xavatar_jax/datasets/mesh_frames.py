@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from xavatar_jax.body import BodyModel, BodyParams, hands_to_relative, pose_groups
-from xavatar_jax.datasets.capture import one_shape
-from xavatar_jax.datasets.frame_params import read_frame_params, stack_params
-from xavatar_jax.files.meshes import read_mesh
-from xavatar_jax.frames import Frames, nearest_part_labels, posed_vertices
+from ..body import BodyModel, BodyParams, hands_to_relative, pose_groups
+from ..files.meshes import read_mesh
+from ..frames import Frames, nearest_part_labels, posed_vertices
+from .capture import one_shape
+from .frame_params import read_frame_params, stack_params
 
 MAX_MISMATCH_M = 0.10  # median distance of a mesh from the body posed like it
 _SAME_VERTICES_M = 0.01

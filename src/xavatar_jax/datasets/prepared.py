@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from xavatar_jax.body import BodyModel
-from xavatar_jax.datasets.capture import Capture, notify, resolve_gender
-from xavatar_jax.datasets.mesh_frames import check_first_frame, mesh_frames, read_params
+from ..body import BodyModel
+from .capture import Capture, notify, resolve_gender
+from .mesh_frames import check_first_frame, mesh_frames, read_params
 
 _PATTERN = "*/SMPLX/mesh-f*_smplx.pkl"
 _MESH_PATTERN = "*/SMPLX/mesh-f*_smplx.ply"

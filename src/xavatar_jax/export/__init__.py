@@ -1,5 +1,5 @@
 """Writing and reading of meshes."""
 
-from xavatar_jax.export.meshes import read_mesh as read_mesh
-from xavatar_jax.export.meshes import write_obj as write_obj
-from xavatar_jax.export.meshes import write_ply as write_ply
+from .meshes import read_mesh as read_mesh
+from .meshes import write_obj as write_obj
+from .meshes import write_ply as write_ply

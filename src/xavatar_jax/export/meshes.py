@@ -4,9 +4,9 @@ import os
 
 import numpy as np
 
-from xavatar_jax.files import atomic_path
-from xavatar_jax.files.meshes import read_mesh as read_arrays
-from xavatar_jax.meshing import Mesh
+from ..files import atomic_path
+from ..files.meshes import read_mesh as read_arrays
+from ..meshing import Mesh
 
 
 def write_ply(path: str | os.PathLike[str], mesh: Mesh) -> None:

@@ -77,9 +77,7 @@ class HashEncoding(eqx.Module):
         cell = jnp.floor(jax.lax.stop_gradient(u))
         fraction = u - cell
         corners = cell.astype(jnp.int32)[:, None, :] + _CORNERS  # (levels, 8, 3)
-        rows = jnp.stack(
-            [self._rows(level, corners[level]) for level in range(len(self.spacing))]
-        )
+        rows = jnp.stack([self._rows(level, corners[level]) for level in range(len(self.spacing))])
         lerp = jnp.where(_CORNERS == 1, fraction[:, None, :], 1 - fraction[:, None, :]).prod(-1)
         return jnp.einsum("lc,lcf->lf", lerp, self.table[rows])
 
@@ -91,4 +89,3 @@ class HashEncoding(eqx.Module):
         mixed = corners.astype(jnp.uint32) * _PRIMES
         mixed = mixed[:, 0] ^ mixed[:, 1] ^ mixed[:, 2]
         return offset + (mixed % np.uint32(size)).astype(jnp.int32)
-

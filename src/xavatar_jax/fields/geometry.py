@@ -134,9 +134,7 @@ class HashGeometry(AbstractGeometryField):
         reached = self.tree.subtree(head[0]) if head else range(self.tree.num_joints)
         return rows.at[np.asarray(reached)].add(params.expression @ self.expression_weights)
 
-    def __call__(
-        self, x_c: Float[Array, "3"], condition: Float[Array, "J K"]
-    ) -> Float[Array, ""]:
+    def __call__(self, x_c: Float[Array, "3"], condition: Float[Array, "J K"]) -> Float[Array, ""]:
         features = self.encoding(x_c) * self._level_mask(x_c)[:, None]
         local = self._nearness(x_c) @ condition
         h = jnp.concatenate([features.reshape(-1), local])

@@ -10,6 +10,7 @@ Cells near the body store their nodes; elsewhere a cell answers with the nearest
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -148,7 +149,8 @@ def build_part_grids(
         last = np.ceil((own.max(0) + reach - low) / coarse)
         near = vertices[
             np.all(
-                (vertices > low + first * coarse - reach) & (vertices < low + last * coarse + reach),
+                (vertices > low + first * coarse - reach)
+                & (vertices < low + last * coarse + reach),
                 axis=1,
             )
         ]
@@ -182,7 +184,7 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         # A cell without nodes answers with the nearest cell that has some.
         order = np.full(near.shape, -1)
         order.ravel()[flat] = np.arange(len(flat))
-        nearest = distance_transform_edt(~near, return_distances=False, return_indices=True)
+        nearest: Any = distance_transform_edt(~near, return_distances=False, return_indices=True)
         dense = order[tuple(nearest)].ravel() + cell_count
         covered_here = np.ones(len(flat), bool)
         # Those stand-ins are doubled, so that a cell knows whether it was asked for itself.
@@ -224,7 +226,8 @@ def _cells_near(
     occupied[tuple(ijk[inside].T)] = True
     if not occupied.any():
         raise ValueError("a part grid has no vertices inside its box")
-    return distance_transform_edt(~occupied) * step <= band + step
+    away: Any = distance_transform_edt(~occupied)
+    return away * step <= band + step
 
 
 def _with_margins(

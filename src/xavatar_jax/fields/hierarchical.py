@@ -37,10 +37,11 @@ class _Layout(NamedTuple):
 @lru_cache
 def _layout(tree: KinematicTree) -> _Layout:
     count = tree.num_joints
-    gate = np.zeros(count, int)
+    # 32 bits: JAX remembers the width that a 64-bit index array had under the other x64 setting.
+    gate = np.zeros(count, np.int32)
     leaf = np.zeros(count, bool)
     groups: list[tuple[int, ...]] = []
-    group_of = np.full(count, -1)
+    group_of = np.full(count, -1, np.int32)
     # The root needs no logit of its own: index 0 is its gate. Later branches get new logits.
     extra = count
     for joint in range(count):
@@ -58,7 +59,7 @@ def _layout(tree: KinematicTree) -> _Layout:
             group_of[list(children)] = len(groups)
             groups.append(children)
     width = max((len(g) for g in groups), default=1)
-    siblings = np.zeros((max(len(groups), 1), width), int)
+    siblings = np.zeros((max(len(groups), 1), width), np.int32)
     mask = np.zeros(siblings.shape, bool)
     for row, members in enumerate(groups):
         siblings[row, : len(members)] = members
@@ -70,7 +71,7 @@ def _layout(tree: KinematicTree) -> _Layout:
         while node > 0:
             paths[joint, node] = 1
             node = tree.parents[node]
-    parents = np.maximum(np.asarray(tree.parents), 0)
+    parents = np.maximum(np.asarray(tree.parents, np.int32), 0)
     return _Layout(extra, gate, leaf, parents, siblings, mask, group_of, paths)
 
 
@@ -93,13 +94,18 @@ def hierarchical_softmax(
     passed = jax.nn.log_sigmoid(gates)
     kept = jnp.where(lay.is_leaf, 0.0, jax.nn.log_sigmoid(-gates))
     group_logits = jnp.where(lay.sibling_mask, logits[..., lay.siblings], -jnp.inf)
+    none = jnp.zeros_like(logits[..., :1])  # the group of joints that have no siblings
     if lay.sibling_mask.any():
-        total = jax.nn.logsumexp(group_logits, axis=-1)
+        # Shares are taken from the largest sibling's logit: in float32 the difference to a sum of
+        # large logits would lose the digits that make the shares sum to one.
+        peak = jax.lax.stop_gradient(jnp.max(group_logits, axis=-1))
+        total = jax.nn.logsumexp(group_logits - peak[..., None], axis=-1)
+        peak, total = (jnp.concatenate([value, none], axis=-1) for value in (peak, total))
     else:
-        total = jnp.zeros((*logits.shape[:-1], 0), logits.dtype)
-    total = jnp.concatenate([total, jnp.zeros_like(logits[..., :1])], axis=-1)
+        peak = total = none
     lone = lay.group_of == (total.shape[-1] - 1)
-    share = jnp.where(lone, 0.0, logits[..., : tree.num_joints] - total[..., lay.group_of])
+    own = logits[..., : tree.num_joints] - peak[..., lay.group_of]
+    share = jnp.where(lone, 0.0, own - total[..., lay.group_of])
     entered = passed[..., lay.parent] + share
     # log m_j is the sum of what each ancestor let through.
     arrived = jnp.matmul(

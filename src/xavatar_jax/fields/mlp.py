@@ -22,7 +22,8 @@ def sharp_softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class WeightNormLinear(eqx.Module):
-    """A linear layer whose rows have a direction and a separate length (Salimans & Kingma, 2016)."""
+    """A linear layer with a direction and a separate length for each row (Salimans & Kingma,
+    2016)."""
 
     direction: Float[Array, "out in"]
     length: Float[Array, " out"]
@@ -116,6 +117,7 @@ class ImplicitMLP(eqx.Module):
         encoded = positional_encoding(x, self.shape.octaves)
         if self.embedding is not None:
             assert condition is not None
+            assert self.embedding_bias is not None
             condition = self.embedding @ condition + self.embedding_bias
         h = hidden = encoded
         for k, layer in enumerate(self.layers):

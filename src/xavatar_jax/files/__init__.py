@@ -4,10 +4,10 @@ from .atomic import atomic_folder as atomic_folder
 from .atomic import atomic_path as atomic_path
 from .cache import cache_dir as cache_dir
 from .checksum import file_checksum as file_checksum
-from .unpickle import load_npz as load_npz
-from .unpickle import load_pickle as load_pickle
-from .unpickle import UnsafePickleError as UnsafePickleError
 from .trees import flatten_named as flatten_named
 from .trees import load_arrays as load_arrays
 from .trees import save_arrays as save_arrays
 from .trees import unflatten_named as unflatten_named
+from .unpickle import UnsafePickleError as UnsafePickleError
+from .unpickle import load_npz as load_npz
+from .unpickle import load_pickle as load_pickle

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
-    """The folder for bodies, captures and pre-fitted fields: `override`, or the user's cache folder.
+    """Where bodies, captures and fitted starts are kept: `override`, or the user's cache folder.
 
     `XDG_CACHE_HOME` is honoured. The folder is made if it is missing.
     """

@@ -142,7 +142,7 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     A zero-dimensional object array comes back as the object inside (a dict, most often).
 
-    **Raises:** `UnsafePickleError`, `ValueError` naming the file and the entry, `FileNotFoundError`.
+    **Raises:** `UnsafePickleError`, `ValueError` naming file and entry, `FileNotFoundError`.
     """
     entries: dict[str, Any] = {}
     name = ""

@@ -1,8 +1,8 @@
 """Posed meshes with the body parameters of each: what an avatar is learned from."""
 
-from xavatar_jax.frames.frames import Frame as Frame
-from xavatar_jax.frames.frames import Frames as Frames
-from xavatar_jax.frames.posed import frames_from_params as frames_from_params
-from xavatar_jax.frames.posed import nearest_part_labels as nearest_part_labels
-from xavatar_jax.frames.posed import posed_vertices as posed_vertices
-from xavatar_jax.frames.select import spread as spread
+from .frames import Frame as Frame
+from .frames import Frames as Frames
+from .posed import frames_from_params as frames_from_params
+from .posed import nearest_part_labels as nearest_part_labels
+from .posed import posed_vertices as posed_vertices
+from .select import spread as spread

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, Int8
 
-from xavatar_jax.body import BodyParams
-from xavatar_jax.files.meshes import check_mesh, read_mesh
+from ..body import BodyParams
+from ..files.meshes import check_mesh, read_mesh
 
 LoadMesh = Callable[[int], tuple[np.ndarray, np.ndarray]]
 PartLabels = np.ndarray | Callable[[int], np.ndarray | None] | None

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, Int8
 
-from xavatar_jax.body import BodyModel, BodyParams, pose_body
-from xavatar_jax.frames.frames import Frames
+from ..body import BodyModel, BodyParams, pose_body
+from .frames import Frames
 
 
 @eqx.filter_jit

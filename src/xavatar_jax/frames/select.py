@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int
 
-from xavatar_jax.frames.frames import Frames
+from .frames import Frames
 
 
 def spread(frames: Frames, n: int | None) -> Int[np.ndarray, " n"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from xavatar_jax.geometry._check import check_mesh, check_points
+from ._check import check_mesh, check_points
 
 
 class ClosestPoints(NamedTuple):

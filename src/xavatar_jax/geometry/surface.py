@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from xavatar_jax.geometry._check import check_mesh
+from ._check import check_mesh
 
 
 def _doubled_area_vectors(

@@ -45,8 +45,7 @@ class KinematicTree:
         for joint, parent in enumerate(self.parents[1:], start=1):
             depth[joint] = depth[parent] + 1
         return tuple(
-            tuple(j for j in range(self.num_joints) if depth[j] == d)
-            for d in range(max(depth) + 1)
+            tuple(j for j in range(self.num_joints) if depth[j] == d) for d in range(max(depth) + 1)
         )
 
     @cached_property

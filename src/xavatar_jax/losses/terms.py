@@ -20,9 +20,7 @@ def binary_cross_entropy(
     return jnp.maximum(logit, 0) - logit * target + jnp.log1p(jnp.exp(-jnp.abs(logit)))
 
 
-def squared_error(
-    value: Float[Array, "*n"], target: Float[Array, "*n"]
-) -> Float[Array, "*n"]:
+def squared_error(value: Float[Array, "*n"], target: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """$(v - t)^2$. **Raises:** `ValueError` if the shapes differ."""
     _same_shape(value, target)
     return (value - target) ** 2

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from xavatar_jax.meshing.cube_table import MAX_SIDES, cube_table
-from xavatar_jax.meshing.octree import Octree
+from .cube_table import MAX_SIDES, cube_table
+from .octree import Octree
 
 _AROUND = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=np.int64) - 1
 

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from xavatar_jax.meshing.extract import _check_bounds
-from xavatar_jax.meshing.mesh import Mesh
-from xavatar_jax.meshing.sampler import EmptyLevelSetError, FieldSampler, ScalarField
+from .extract import _check_bounds
+from .mesh import Mesh
+from .sampler import EmptyLevelSetError, FieldSampler, ScalarField
 
 
 def marching_cubes(

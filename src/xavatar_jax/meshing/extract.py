@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from xavatar_jax.geometry import check_points
-from xavatar_jax.meshing.contour import dual_polygons, triangulate
-from xavatar_jax.meshing.mesh import Mesh
-from xavatar_jax.meshing.octree import Octree, refine, root_octree
-from xavatar_jax.meshing.place import place_between, spread_and_project
-from xavatar_jax.meshing.sampler import EmptyLevelSetError, FieldSampler, ScalarField, VectorField
+from ..geometry import check_points
+from .contour import dual_polygons, triangulate
+from .mesh import Mesh
+from .octree import Octree, refine, root_octree
+from .place import place_between, spread_and_project
+from .sampler import EmptyLevelSetError, FieldSampler, ScalarField, VectorField
 
 _MAX_COARSE, _MAX_LEAVES = 100_000, 20_000_000
 

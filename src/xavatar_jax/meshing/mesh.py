@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from xavatar_jax.geometry import check_mesh, enclosed_volume, face_areas, vertex_normals
+from ..geometry import check_mesh, enclosed_volume, face_areas, vertex_normals
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from xavatar_jax.meshing.sampler import FieldSampler
+from .sampler import FieldSampler
 
 _OCTANTS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=np.int32)
 _AXES = np.repeat(np.arange(3), 2)

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from xavatar_jax.meshing.octree import Octree
-from xavatar_jax.meshing.sampler import FieldSampler
+from .octree import Octree
+from .sampler import FieldSampler
 
 _MARGIN = 0.02
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from xavatar_jax.geometry import ClosestPointTree, face_normals, sample_surface
-from xavatar_jax.meshing import Mesh
+from ..geometry import ClosestPointTree, face_normals, sample_surface
+from ..meshing import Mesh
 
 
 class SurfaceSamples(NamedTuple):

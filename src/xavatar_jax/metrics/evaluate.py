@@ -5,16 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from xavatar_jax.geometry import (
+from ..geometry import (
     ClosestPointTree,
     WindingNumberTree,
     check_points,
     nearest_vertices,
 )
-from xavatar_jax.meshing import Mesh
-from xavatar_jax.metrics.distances import SurfaceSamples, chamfer, measure_samples
-from xavatar_jax.metrics.overlap import box_of, box_overlap, joint_box, point_overlap
-from xavatar_jax.metrics.record import MeshMetrics, RegionValues
+from ..meshing import Mesh
+from .distances import SurfaceSamples, chamfer, measure_samples
+from .overlap import box_of, box_overlap, joint_box, point_overlap
+from .record import MeshMetrics, RegionValues
 
 # Labels are indices into the body's parts: body, face, left_hand, right_hand, eyes_mouth.
 # Each region is one or more pieces; overlaps are taken piece by piece and averaged.

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from xavatar_jax.body import SMPLH_TREE, SMPLX_TREE
-from xavatar_jax.files import atomic_path, load_npz
-from xavatar_jax.motion.grab import is_grab, read_grab, text
-from xavatar_jax.motion.record import Motion, UpAxis
+from ..body import SMPLH_TREE, SMPLX_TREE
+from ..files import atomic_path, load_npz
+from .grab import is_grab, read_grab, text
+from .record import Motion, UpAxis
 
 _FPS_KEYS = ("mocap_frame_rate", "mocap_framerate")
 # Key and number of joints, in the order of the 55 SMPL-X joints.

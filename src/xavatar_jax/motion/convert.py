@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.body import BodyParams
-from xavatar_jax.body.params import MAX_DEFAULT_COEFFICIENTS
+from ..body import BodyParams
+from ..body.params import MAX_DEFAULT_COEFFICIENTS
 
 if TYPE_CHECKING:
-    from xavatar_jax.body import BodyModel
-    from xavatar_jax.motion.record import Motion, UpAxis
+    from ..body import BodyModel
+    from .record import Motion, UpAxis
 
 
 class MotionNotice(UserWarning):
@@ -114,7 +114,7 @@ def from_params(
     Raises:
         ValueError: the parameters have no single batch axis, or their betas differ by frame.
     """
-    from xavatar_jax.motion.record import Motion
+    from .record import Motion
 
     pose = np.asarray(params.pose, np.float64)
     if pose.ndim != 3:

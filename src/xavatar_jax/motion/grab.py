@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from xavatar_jax.body import SMPLX_TREE
-from xavatar_jax.motion.record import Motion, UpAxis
+from ..body import SMPLX_TREE
+from .record import Motion, UpAxis
 
 
 def is_grab(data: dict[str, Any]) -> bool:

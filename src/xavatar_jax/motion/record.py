@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.motion import convert, resampling, rotate
+from . import convert, resampling, rotate
 
 if TYPE_CHECKING:
-    from xavatar_jax.body import BodyModel, BodyParams
+    from ..body import BodyModel, BodyParams
 
 UpAxis = Literal["y", "z"]
 

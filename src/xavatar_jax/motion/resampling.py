@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 if TYPE_CHECKING:
-    from xavatar_jax.motion.record import Motion
+    from .record import Motion
 
 
 def resample(motion: Motion, fps: float) -> Motion:

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.body import rest_joints
+from ..body import rest_joints
 
 if TYPE_CHECKING:
-    from xavatar_jax.body import BodyModel
-    from xavatar_jax.motion.record import Motion, UpAxis
+    from ..body import BodyModel
+    from .record import Motion, UpAxis
 
 # Rotations that carry one up axis to the other, about x, so that x stays.
 _TO_UP = {

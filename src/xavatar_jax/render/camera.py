@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from xavatar_jax.geometry import check_points
+from ..geometry import check_points
 
 Vector = np.ndarray | Sequence[float | int]
 

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
-from xavatar_jax.render.sheet import draw_text
+from .sheet import draw_text
 
 # From calm blue by yellow to red, with lightness rising to the middle and saturation to the end.
 _TABLE = np.array(

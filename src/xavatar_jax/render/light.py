@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.render.camera import Camera
-from xavatar_jax.render.rays import RayScene, hemisphere_directions, tangent_frames
+from .camera import Camera
+from .rays import RayScene, hemisphere_directions, tangent_frames
 
 # Directions to the lights in the frame (right, up, toward the camera), and linear colours.
 _KEY, _KEY_COLOR = np.array([-0.55, 0.75, 0.75]), np.array([1.95, 1.88, 1.78])

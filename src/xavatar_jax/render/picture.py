@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from xavatar_jax.geometry import face_normals
-from xavatar_jax.meshing import Mesh
-from xavatar_jax.render.camera import Camera
-from xavatar_jax.render.light import (
+from ..geometry import face_normals
+from ..meshing import Mesh
+from .camera import Camera
+from .light import (
     _SKY_RAYS,
     key_visibility,
     openness,
@@ -16,7 +16,7 @@ from xavatar_jax.render.light import (
     to_linear,
     to_srgb,
 )
-from xavatar_jax.render.rays import Hits, RayScene
+from .rays import Hits, RayScene
 
 SHADINGS = ("color", "error", "normal", "flat")
 _GROUND_NODES, _GROUND_RAYS = 64, 64

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from xavatar_jax.meshing import Mesh
+from ..meshing import Mesh
 
 
 class Hits(NamedTuple):

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import UInt8
 
-from xavatar_jax.files import atomic_path
+from ..files import atomic_path
 
 
 def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> None:

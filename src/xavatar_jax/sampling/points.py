@@ -127,4 +127,3 @@ def _draw(
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     a, b, c = (vertices[faces[face, k]] for k in range(3))
     return a + u[:, None] * (b - a) + v[:, None] * (c - a), face
-

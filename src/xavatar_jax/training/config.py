@@ -16,7 +16,7 @@ class SkinningConfig:
     """`grid`: template weights on part grids with a learned correction; `mlp`: the paper's."""
 
     kind: Literal["grid", "mlp"] = "grid"
-    grid: GridSpacing = GridSpacing()
+    grid: GridSpacing = GridSpacing(face=0.0054)
     correction: GridSpacing = GridSpacing(body=0.048, hands=0.012, face=0.024)
     mlp: MLPShape = PAPER_SKINNING
     learned: bool = True
@@ -34,7 +34,7 @@ class GeometryConfig:
     spacing: tuple[float, ...] = (0.12, 0.07, 0.042, 0.025, 0.015, 0.009, 0.0055, 0.0034)
     trunk: float = 0.009
     hands: float = 0.0034
-    face: float = 0.0055
+    face: float = 0.0034
     features: int = 2
     log2_size: int = 17
     width: int = 64
@@ -114,7 +114,7 @@ class FitConfig:
     skinning_every: int = 4
     skinning_points: int = 128
     polish_every: int = 400
-    prefit_steps: int = 300
+    prefit_steps: int = 200
     points: SamplingPlan = SamplingPlan()
     skinning: SkinningConfig = SkinningConfig()
     geometry: GeometryConfig = GeometryConfig()

@@ -184,5 +184,6 @@ def _check_finite(values: dict[str, float], step: int) -> None:
         if not np.isfinite(value):
             raise TrainingError(
                 f"the {name} term is {value} at step {step}: training has stopped. Lower the "
-                "learning rate, or look for a frame whose mesh and parameters do not belong together."
+                "learning rate, or look for a frame whose mesh and parameters do not belong "
+                "together."
             )

@@ -23,7 +23,6 @@ from ..fields import (
 )
 from .config import FitConfig, GeometryConfig, SkinningConfig
 
-
 # Metres around the mean shape's hands and face where detail is heard: another person's hands are
 # some centimetres away.
 _DETAIL_MARGIN = 0.1
@@ -96,15 +95,15 @@ def settle_on_person(
     has a direct solution, which gradient descent from the mean shape would take long to find
     where a hand lies some centimetres away. Networks come back as they are.
     """
-    betas = jnp.asarray(betas, body.template.dtype)
+    shape = jnp.asarray(betas, body.template.dtype)
     if isinstance(fields.skinning, GridSkinning):
-        vertices = np.asarray(canonical_vertices(body, betas), np.float64)
+        vertices = np.asarray(canonical_vertices(body, shape), np.float64)
         grid = template_grid_skinning(
             body, vertices, config.skinning.grid, config.skinning.correction
         )
         fields = eqx.tree_at(lambda f: f.skinning, fields, grid)
     if isinstance(fields.geometry, HashGeometry):
-        joints = jnp.asarray(canonical_joints(body, betas), jnp.float32)
+        joints = jnp.asarray(canonical_joints(body, shape), jnp.float32)
         fields = eqx.tree_at(lambda f: f.geometry.joints, fields, joints)
     return fields
 

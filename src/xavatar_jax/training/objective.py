@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..body import FACE, FACES, HANDS, BodyModel, BodyParams, canonical_joints, canonical_vertices
+from ..body import FACE, HANDS, BodyModel, BodyParams, canonical_joints, canonical_vertices
 from ..correspondence import Broyden, implicit_root, search_field, start_table
 from ..kinematics import KinematicTree
 from ..losses import binary_cross_entropy, soft_occupancy, squared_error

@@ -19,8 +19,8 @@ from ..fields import (
     pose_grid,
     tabulate,
 )
-from ..kinematics import inverse_3x3, skin_points
 from ..frames import Frame, Frames, nearest_part_labels
+from ..kinematics import inverse_3x3, skin_points
 from ..sampling import sample_frame
 from .config import FitConfig
 
@@ -147,10 +147,10 @@ def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool
     several = (count > 1).sum(1)
     width = max(int(several.max()), 1)
 
-    def sort(leaf: Array) -> np.ndarray:
-        leaf = np.asarray(leaf)
-        index = order.reshape(*order.shape, *(1,) * (leaf.ndim - 2))
-        return np.take_along_axis(leaf, index, axis=1)
+    def sort(leaf: Array | np.ndarray) -> np.ndarray:
+        values = np.asarray(leaf)
+        index = order.reshape(*order.shape, *(1,) * (values.ndim - 2))
+        return np.take_along_axis(values, index, axis=1)
 
     roots, valid = sort(roots), sort(valid)
     return FramePool(
@@ -197,7 +197,5 @@ def polish_roots(
 
         return jax.lax.map(one_frame, frames)
 
-    root, others = polish(
-        skinning, table, (pool.points, pool.root, pool.others, pool.transforms)
-    )
+    root, others = polish(skinning, table, (pool.points, pool.root, pool.others, pool.transforms))
     return eqx.tree_at(lambda p: (p.root, p.others), pool, (root, others))

@@ -97,9 +97,7 @@ def make_steps(
     rates = config.optimiser
     plans: dict[str, tuple[Any, int, int, float, int]] = {}
     if config.search.cached:
-        plans["geometry"] = (
-            geometry_objective, points, several, rates.learning_rate, config.steps
-        )
+        plans["geometry"] = (geometry_objective, points, several, rates.learning_rate, config.steps)
         if config.skinning.learned:
             count = min(config.skinning_points, points)
             plans["skinning"] = (
@@ -115,9 +113,7 @@ def make_steps(
     for name, (objective, count, many, rate, total) in plans.items():
         optimiser = make_optimiser(config, rate, total)
         optimisers[name] = optimiser.init(_own(learned, name))
-        steps[name] = _make_step(
-            name, objective, optimiser, fixed, anchors, config, count, many
-        )
+        steps[name] = _make_step(name, objective, optimiser, fixed, anchors, config, count, many)
     return TrainState(learned, optimisers, jnp.zeros((), jnp.int32)), steps
 
 

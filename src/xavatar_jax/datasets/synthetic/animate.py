@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.body import BodyModel, rest_joints
-from xavatar_jax.datasets.synthetic.hand_shapes import HAND_SHAPES, left_hand_pose
-from xavatar_jax.datasets.synthetic.inverse_kinematics import (
+from ...body import BodyModel, rest_joints
+from ...motion import Motion
+from .hand_shapes import HAND_SHAPES, left_hand_pose
+from .inverse_kinematics import (
     rotation_about,
     to_matrix,
     to_rotvec,
     two_bone,
     unit,
 )
-from xavatar_jax.datasets.synthetic.keys import Arm, Key
-from xavatar_jax.datasets.synthetic.limits import joint_limits
-from xavatar_jax.motion import Motion
+from .keys import Arm, Key
+from .limits import joint_limits
 
 _X, _Y, _Z = np.eye(3)
 _MIRROR = np.array([-1.0, 1.0, 1.0])  # of places; of rotations its opposite, the axis vector

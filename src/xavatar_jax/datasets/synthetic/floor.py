@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from xavatar_jax.body import BodyModel, BodyParams, pose_body
-from xavatar_jax.motion import Motion
+from ...body import BodyModel, BodyParams, pose_body
+from ...motion import Motion
 
 _LOW_JOINTS = ("left_ankle", "right_ankle")
 

@@ -7,7 +7,7 @@ and body poses of their own.
 
 from __future__ import annotations
 
-from xavatar_jax.datasets.synthetic.keys import Arm, Foot, Gaze, Key, Pelvis, Torso, sequence
+from .keys import Arm, Foot, Gaze, Key, Pelvis, Torso, sequence
 
 # Expression coefficients of the bundled body.
 SMILE, OPEN, BROWS_UP, FROWN, POUT, PUFF, WIDE, NOSE, SQUINT, SMIRK = range(10)

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from xavatar_jax.body import BodyModel, rest_vertices, synthetic_body
-from xavatar_jax.datasets.capture import Capture
-from xavatar_jax.datasets.grab import load_grab
-from xavatar_jax.datasets.synthetic.animate import animate
-from xavatar_jax.datasets.synthetic.floor import on_floor
-from xavatar_jax.datasets.synthetic.sequences import TEST_SEQUENCES, TRAIN_SEQUENCES
-from xavatar_jax.files import atomic_folder, cache_dir
-from xavatar_jax.motion import Motion, save_amass
+from ...body import BodyModel, rest_vertices, synthetic_body
+from ...files import atomic_folder, cache_dir
+from ...motion import Motion, save_amass
+from ..capture import Capture
+from ..grab import load_grab
+from .animate import animate
+from .floor import on_floor
+from .sequences import TEST_SEQUENCES, TRAIN_SEQUENCES
 
 FPS = 30.0
 _SEED = 20

@@ -1,0 +1,167 @@
+"""The avatar as a user meets it: meshes, occupancy, evaluation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import xavatar_jax as xa
+from xavatar_jax.avatar import CellSizes
+from xavatar_jax.body import SMPL_TREE, canonical_vertices
+from xavatar_jax.geometry import closest_points, winding_number
+from xavatar_jax.meshing import EmptyLevelSetError
+
+
+def test_fit_learns_the_person(run):
+    """Held-out surfaces are met within what 120 steps on coarse grids can give."""
+    after = xa.evaluate(run.fit.avatar, run.test, num_frames=2, verbose=False).mean
+    before = xa.evaluate(run.fit.before, run.test, num_frames=1, verbose=False).mean
+    assert after.cd_mm.all < 1.5
+    assert after.cd_mm.hands < 1.5
+    assert after.iou.all > 0.95
+    assert after.cd_mm.all < 0.5 * before.cd_mm.all
+
+
+def test_quiet_fit_prints_nothing(run, capsys):
+    xa.evaluate(run.fit.avatar, run.test, num_frames=1, verbose=False)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == ""
+
+
+def test_history_has_every_term(run):
+    history = run.fit.history
+    assert history.steps_done == run.config.steps
+    assert {"loss", "occupancy", "bone", "skinning_surface", "skinning_joint"} <= set(history.terms)
+    assert history.terms["occupancy"][-1] < history.terms["occupancy"][0]
+    assert {"prefit", "settle", "labels", "roots", "compile", "train", "total"} <= set(
+        history.seconds
+    )
+
+
+def test_mesh_is_closed_and_follows_translation(run):
+    frame = run.test[0]
+    mesh = run.fit.avatar.mesh(frame.params)
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 2).all()
+    assert mesh.num_vertices <= 50_000
+    assert np.abs(mesh.vertices.mean(0) - frame.vertices.mean(0)).max() < 0.05
+
+
+def test_all_poses_share_faces(run):
+    avatar = run.fit.avatar
+    first, second = (avatar.mesh(run.test[k].params) for k in (0, 1))
+    assert np.array_equal(first.faces, second.faces)
+
+
+def test_max_vertices_is_kept(run):
+    mesh = run.fit.avatar.canonical_mesh(max_vertices=5000)
+    assert mesh.num_vertices <= 5000
+
+
+def test_full_mode_agrees_with_fast_mode(run):
+    """Extraction of the posed field and skinning of the canonical surface meet."""
+    params = run.test[0].params
+    coarse = CellSizes(body=0.03, head=0.02, face=0.02, hands=0.01)
+    full = run.fit.avatar.mesh(params, mode="full", cell=coarse)
+    fast = run.fit.avatar.mesh(params)
+    distance, _, _ = closest_points(fast.vertices, fast.faces, full.vertices)
+    # Chords of coarse cells lie inside the surface by about cell^2 / (8 radius).
+    assert np.median(distance) < 0.003
+    assert np.quantile(distance, 0.95) < 0.012
+
+
+def test_occupancy_knows_inside_from_outside(run):
+    frame = run.test[0]
+    rng = np.random.default_rng(0)
+    rows = rng.choice(len(frame.vertices), 400)
+    points = frame.vertices[rows] + 0.02 * rng.standard_normal((400, 3)).astype(np.float32)
+    distance, _, _ = closest_points(frame.vertices, frame.faces, points)
+    clear = distance > 0.004
+    inside = winding_number(frame.vertices, frame.faces, points) > 0.5
+    value = np.asarray(run.fit.avatar.occupancy(jnp.asarray(points), frame.params))
+    assert ((value >= 0) & (value <= 1)).all()
+    assert ((value > 0.5) == inside)[clear].mean() > 0.99
+
+
+def test_far_points_are_outside(run):
+    far = jnp.asarray([[10.0, 0.0, 0.0], [0.0, -30.0, 2.0]])
+    assert np.array_equal(run.fit.avatar.occupancy(far, run.test[0].params), [0.0, 0.0])
+
+
+def test_occupancy_is_differentiable_in_points_and_pose(run):
+    """Against central differences of the posed field itself, searched anew at each point."""
+    avatar, frame = run.fit.avatar, run.test[1]
+    labels = np.asarray(run.body.part_labels)
+    rows = np.flatnonzero(labels == 0)[::900][:8]
+    points = jnp.asarray(frame.vertices[rows])
+
+    def logits(x, pose):
+        params = xa.BodyParams.create(
+            run.body,
+            pose=pose,
+            betas=frame.params.betas,
+            expression=frame.params.expression,
+            transl=frame.params.transl,
+        )
+        return avatar.query(x, params).logit
+
+    pose = frame.params.pose
+    gradient = jax.vmap(jnp.diag)(
+        jnp.moveaxis(jax.jacrev(lambda x: logits(x, pose))(points), 2, 0)
+    ).T
+    step = 2e-4
+    for axis in range(3):
+        moved = jnp.zeros(3).at[axis].set(step)
+        numeric = (logits(points + moved, pose) - logits(points - moved, pose)) / (2 * step)
+        scale = np.linalg.norm(gradient, axis=1).max()
+        # Feature grids are linear between nodes: differences may straddle a kink.
+        assert np.median(np.abs(numeric - gradient[:, axis])) < 0.03 * scale
+    by_pose = jax.jacrev(lambda p: logits(points, p).sum())(pose)
+    assert np.isfinite(by_pose).all()
+    elbow = run.body.tree.index("spine3")
+    turn = jnp.zeros_like(pose).at[elbow, 2].set(1e-3)
+    numeric = (logits(points, pose + turn).sum() - logits(points, pose - turn).sum()) / 2e-3
+    assert abs(float(numeric) - float(by_pose[elbow, 2])) < 0.1 * max(abs(float(numeric)), 5.0)
+
+
+def test_skin_weights_are_those_of_the_template_on_the_surface(run):
+    avatar = run.fit.avatar
+    vertices = np.asarray(canonical_vertices(run.body, jnp.asarray(avatar.betas)))
+    weights = np.asarray(avatar.skin_weights(jnp.asarray(vertices)))
+    assert np.abs(weights.sum(1) - 1).max() < 1e-5
+    assert weights.min() >= 0
+    assert np.median(np.abs(weights - np.asarray(run.body.weights)).max(1)) < 0.05
+
+
+def test_unknown_mode_is_named(run):
+    with pytest.raises(ValueError, match="unknown mode 'quick'"):
+        run.fit.avatar.mesh(run.test[0].params, mode="quick")
+
+
+def test_nan_parameters_are_named(run):
+    params = xa.BodyParams.create(run.body, pose=np.full((55, 3), np.nan))
+    with pytest.raises(ValueError, match=r"params\.pose"):
+        run.fit.avatar.mesh(params)
+
+
+def test_parameters_of_another_tree_are_refused(run):
+    other = xa.BodyParams(
+        pose=jnp.zeros((24, 3)),
+        betas=jnp.zeros(10),
+        expression=jnp.zeros(0),
+        transl=jnp.zeros(3),
+        tree=SMPL_TREE,
+    )
+    with pytest.raises(ValueError, match="24 joints"):
+        run.fit.avatar.mesh(other)
+
+
+def test_a_field_without_surface_is_an_error(run):
+    fields = run.fit.avatar.fields
+    empty = eqx.tree_at(lambda f: f.geometry.biases[2], fields, jnp.full(1, -1000.0))
+    avatar = xa.Avatar(run.body, run.fit.avatar.betas, empty, run.config)
+    with pytest.raises(EmptyLevelSetError):
+        avatar.canonical_mesh()

@@ -1,0 +1,100 @@
+"""The avatar's file: what is in it, and what is not."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import xavatar_jax as xa
+from xavatar_jax.files import load_arrays, save_arrays
+
+
+@pytest.fixture(scope="module")
+def saved(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("avatar") / "avatar.npz"
+    run.fit.avatar.save(path)
+    return path
+
+
+def test_round_trip_gives_the_same_mesh(run, saved):
+    again = xa.load_avatar(saved, body=run.body)
+    params = run.test[0].params
+    assert np.array_equal(again.mesh(params).vertices, run.fit.avatar.mesh(params).vertices)
+    assert again.config == run.config
+    assert again.steps == run.config.steps
+
+
+def test_body_is_found_by_its_path(run, saved):
+    assert xa.load_avatar(saved).body.source == run.body.source
+
+
+def test_file_holds_nothing_of_the_body(run, saved):
+    """No array has a row a vertex, or a grid node: those come from the body's own arrays."""
+    arrays, header = load_arrays(saved)
+    grids = run.fit.avatar.fields.skinning.grids
+    for name, value in arrays.items():
+        assert run.body.num_vertices not in value.shape, name
+        assert grids.num_nodes not in value.shape, name
+    assert header["body"]["checksum"] == run.body.source.checksum
+    json.dumps(header, allow_nan=False)
+
+
+def test_missing_body_says_what_is_needed(saved, tmp_path):
+    arrays, header = load_arrays(saved)
+    header["body"]["path"] = "/nowhere/SMPLX_NEUTRAL.npz"
+    path = tmp_path / "avatar.npz"
+    save_arrays(path, arrays, header)
+    with pytest.raises(FileNotFoundError, match=r"SMPLX_NEUTRAL\.npz.*load_avatar\(path, body="):
+        xa.load_avatar(path)
+
+
+def test_other_body_is_refused(run, saved, tmp_path):
+    arrays, header = load_arrays(saved)
+    header["body"]["checksum"] = "0" * 64
+    path = tmp_path / "avatar.npz"
+    save_arrays(path, arrays, header)
+    with pytest.raises(ValueError, match="learned on another body"):
+        xa.load_avatar(path, body=run.body)
+
+
+def test_newer_format_is_refused(run, saved, tmp_path):
+    arrays, header = load_arrays(saved)
+    header["format"] += 1
+    path = tmp_path / "avatar.npz"
+    save_arrays(path, arrays, header)
+    with pytest.raises(ValueError, match="format 2; this version"):
+        xa.load_avatar(path, body=run.body)
+
+
+def test_damaged_file_is_named(run, saved, tmp_path):
+    path = tmp_path / "avatar.npz"
+    shutil.copy(saved, path)
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(ValueError, match=r"avatar\.npz"):
+        xa.load_avatar(path, body=run.body)
+
+
+def test_missing_array_is_named(run, saved, tmp_path):
+    arrays, header = load_arrays(saved)
+    name = next(n for n in arrays if "table" in n)
+    del arrays[name]
+    path = tmp_path / "avatar.npz"
+    save_arrays(path, arrays, header)
+    with pytest.raises(ValueError, match="no array 'geometry"):
+        xa.load_avatar(path, body=run.body)
+
+
+def test_interrupt_while_saving_leaves_the_old_file(run, saved, tmp_path, monkeypatch):
+    path = tmp_path / "avatar.npz"
+    shutil.copy(saved, path)
+    before = path.read_bytes()
+
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run.fit.avatar.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

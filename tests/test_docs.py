@@ -1,0 +1,266 @@
+"""The texts against the project: links, names, commands, options, tables, figures, versions."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import xavatar_jax as xa
+from xavatar_jax.body import PARTS, SMPLX_TREE, canonical_pose, pose_groups
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted(
+    [
+        *(ROOT / n for n in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
+        ROOT / "THIRD_PARTY_NOTICES.md",
+        *(ROOT / "docs").glob("*.md"),
+    ]
+)
+SCRIPTS = sorted([*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")])
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+
+
+def read(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", read(page), re.DOTALL | re.MULTILINE)
+
+
+def without_blocks(page: Path) -> str:
+    return re.sub(r"^```.*?^```", "", read(page), flags=re.DOTALL | re.MULTILINE)
+
+
+def headings(page: Path) -> set[str]:
+    """Anchors that links may name, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.+)$", without_blocks(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
+
+
+def table(page: str, heading: str) -> list[list[str]]:
+    """Rows of the first table after a heading, without head and rule, code marks removed."""
+    text = read(ROOT / "docs" / page).split(f"\n{heading}\n", 1)[1]
+    lines = re.search(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert lines is not None
+    rows = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in lines[0].splitlines()]
+    return rows[2:]
+
+
+def numbers(text: str) -> set[int]:
+    """`0 to 2, 4` as a set."""
+    found: set[int] = set()
+    for part in text.split(","):
+        first, _, last = part.strip().partition(" to ")
+        found |= set(range(int(first), int(last or first) + 1))
+    return found
+
+
+def script_options(script: Path) -> set[str]:
+    """Option names of a script: fields of its options dataclass, and arguments it adds."""
+    tree = ast.parse(read(script))
+    options = {"--help"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef) and node.name == "Options":
+            fields = [n.target for n in node.body if isinstance(n, ast.AnnAssign)]
+            options |= {f"--{f.id.replace('_', '-')}" for f in fields if isinstance(f, ast.Name)}
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
+            options |= {str(a.value) for a in node.args if isinstance(a, ast.Constant)}
+    return options
+
+
+@each_page
+def test_relative_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_blocks(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name} links to {target}"
+        if anchor:
+            assert anchor in headings(file), f"{page.name} links to {target}"
+
+
+@each_page
+def test_named_parts_of_the_library_exist(page):
+    names = set(re.findall(r"\bxa\.(\w+)", read(page)))
+    assert not [name for name in names if not hasattr(xa, name)]
+
+
+@each_page
+def test_named_modules_exist(page):
+    for dotted in set(re.findall(r"`xavatar_jax((?:\.\w+)+)`", read(page))):
+        module, _, name = f"xavatar_jax{dotted}".rpartition(".")
+        found = importlib.util.find_spec(module)
+        assert found is not None, dotted
+        is_module = found.submodule_search_locations and importlib.util.find_spec(module + "." + name)
+        assert is_module or hasattr(importlib.import_module(module), name), dotted
+
+
+@each_page
+def test_python_blocks_parse_and_import_what_exists(page):
+    for block in blocks(page, "python"):
+        tree = ast.parse(block)
+        bound = {a.asname or a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+        bound |= {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+        used = {n.value.id for n in ast.walk(tree) if _is_module_use(n)}
+        assert used & {"xa", "np", "jnp", "jax"} <= {name.split(".")[0] for name in bound}
+
+
+def _is_module_use(node: ast.AST) -> bool:
+    return isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+
+
+@each_page
+def test_commands_name_files_and_options_that_exist(page):
+    for line in "".join(blocks(page, "bash")).splitlines():
+        for script in re.findall(r"(?:examples|benchmarks|docs)/[\w/]+\.py", line):
+            assert (ROOT / script).is_file(), line
+            options = set(re.findall(r"\s(--[\w-]+)", line.split(script, 1)[1]))
+            assert options <= script_options(ROOT / script), line
+
+
+@each_page
+def test_options_named_in_sentences_exist(page):
+    known = set().union(*(script_options(script) for script in SCRIPTS))
+    named = set(re.findall(r"`(--[\w-]+)", without_blocks(page)))
+    assert named <= known
+
+
+def test_option_page_names_every_option_of_the_example():
+    page = read(ROOT / "docs" / "options.md")
+    options = script_options(ROOT / "examples" / "fit_grab.py") - {"--preset", "--quiet"}
+    assert not [option for option in sorted(options) if option not in page]
+
+
+def test_readme_has_two_commands_that_set_themselves_up():
+    commands = [b for b in blocks(ROOT / "README.md", "bash") if b.startswith("python3 -m venv")]
+    assert [c.split(" && ")[-1].strip() for c in commands] == [
+        ".venv/bin/python examples/fit_grab.py",
+        ".venv/bin/python -m pytest",
+    ]
+    # The check of the whole project finds the second one by this pattern.
+    assert "grep -E '^python3 .*-m pytest$' README.md" in read(ROOT / ".ci" / "run")
+    assert re.search(r"^python3 .*-m pytest$", read(ROOT / "README.md"), re.MULTILINE)
+
+
+def test_joint_table_is_the_tree():
+    rows = table("conventions.md", "## Joints")
+    assert [int(r[0]) for r in rows] == list(range(SMPLX_TREE.num_joints))
+    assert tuple(r[1] for r in rows) == SMPLX_TREE.names
+    assert tuple(int(r[2]) for r in rows) == SMPLX_TREE.parents
+    groups = pose_groups(SMPLX_TREE)
+    assert all(int(r[0]) in groups[r[3]] for r in rows)
+
+
+def test_pose_table_is_the_parameter_names():
+    rows = table("conventions.md", "## Body parameters")
+    assert [r[0] for r in rows] == ["pose", "betas", "expression", "transl"]
+    text = read(ROOT / "docs" / "conventions.md")
+    listed = re.findall(r"^\| `(\w+)` \| (\d+) \| ([\d to,]+) \|$", text, re.MULTILINE)
+    groups = pose_groups(SMPLX_TREE)
+    assert {name for name, _, _ in listed} == set(groups)
+    for name, count, joints in listed:
+        assert int(count) == 3 * len(groups[name])
+        assert numbers(joints) == set(groups[name])
+
+
+def test_part_table_is_the_start_groups():
+    rows = table("conventions.md", "## Parts")
+    groups = xa.part_groups(SMPLX_TREE)
+    assert [r[1] for r in rows] == [*PARTS, "full"]
+    assert [r[0] for r in rows] == [*map(str, range(len(PARTS))), ""]
+    for _, part, bones, count in rows:
+        assert numbers(bones) == set(groups[part])
+        assert int(count) == len(groups[part])
+
+
+def test_canonical_table_is_the_canonical_pose(family):
+    rows = table("conventions.md", "## Canonical space")
+    pose = np.zeros((SMPLX_TREE.num_joints, 3))
+    for joint, vector in [(r[0], r[1]) for r in rows if r[0] in SMPLX_TREE.names]:
+        values = vector.strip("()").replace("π/6", str(np.pi / 6))
+        pose[SMPLX_TREE.index(joint)] = [float(v) for v in values.split(",")]
+    np.testing.assert_allclose(canonical_pose(family["smplx"]), pose, atol=1e-7)
+
+
+def test_packages_import_only_what_stands_above_them():
+    order = [row[0] for row in table("how-it-works.md", "## Where things are")]
+    order = [name for cell in order for name in re.findall(r"\w+", cell)]
+    source = ROOT / "src" / "xavatar_jax"
+    assert sorted(order) == sorted(p.name for p in source.iterdir() if (p / "__init__.py").exists())
+    for name in order:
+        for file in (source / name).rglob("*.py"):
+            allowed = {*order[: order.index(name) + 1], "_version"}
+            assert _imported_packages(file, source) <= allowed, file.relative_to(ROOT)
+
+
+def _imported_packages(file: Path, source: Path) -> set[str]:
+    """Packages of this project that a file imports, at its top or inside functions."""
+    inside = ("xavatar_jax", *file.relative_to(source).parent.parts)
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(read(file))):
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = inside[: len(inside) - node.level + 1] if node.level else ()
+            modules = [".".join([*base, *(node.module.split(".") if node.module else [])])]
+            if modules == ["xavatar_jax"]:
+                modules = [f"xavatar_jax.{alias.name}" for alias in node.names]
+        else:
+            continue
+        found |= {m.split(".")[1] for m in modules if m.startswith("xavatar_jax.")}
+    return found
+
+
+def test_tables_of_figures_are_those_of_the_files():
+    spec = importlib.util.spec_from_file_location(
+        "figures_update", ROOT / "docs" / "figures" / "update.py"
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    update = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(update)
+    for name in update.TEXTS:
+        text = read(ROOT / name)
+        assert "<!-- figures: " in text
+        assert update.filled(text) == text, f"{name}: run docs/figures/update.py"
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "docs" / "figures").glob("*.json")), ids=str)
+def test_kept_figures_name_no_path(file):
+    def strings(value):
+        if isinstance(value, dict):
+            value = value.values()
+        if isinstance(value, str):
+            yield value
+        elif not isinstance(value, int | float | None):
+            for item in value:
+                yield from strings(item)
+
+    assert not [s for s in strings(json.loads(read(file))) if "/" in s and "points/s" not in s]
+
+
+def test_version_stands_the_same_everywhere():
+    cited = re.search(r"^version: (\S+)$", read(ROOT / "CITATION.cff"), re.MULTILINE)
+    assert cited is not None
+    assert cited[1] == xa.__version__
+    changes = read(ROOT / "CHANGELOG.md")
+    assert "## [Unreleased]" in changes or f"## [{xa.__version__}]" in changes
+
+
+def test_notices_list_every_dependency():
+    project = re.search(r"^dependencies = \[\n(.*?)^\]", read(ROOT / "pyproject.toml"), re.M | re.S)
+    assert project is not None
+    names = re.findall(r'^\s*"([\w-]+)', project[1], re.MULTILINE)
+    assert len(names) > 10
+    notices = read(ROOT / "THIRD_PARTY_NOTICES.md")
+    assert not [name for name in names if not re.search(rf"^\| .*\b{name}\b", notices, re.M)]

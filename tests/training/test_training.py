@@ -1,0 +1,199 @@
+"""Steps, draws, determinism and failure of training, on pools made by hand."""
+
+import json
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import xavatar_jax as xa
+from xavatar_jax.fields import GridSpacing, MLPShape
+from xavatar_jax.frames import frames_from_params
+from xavatar_jax.training import (
+    PRESETS,
+    TrainingError,
+    config_from_dict,
+    config_to_dict,
+    fresh_fields,
+    trainable_filter,
+)
+from xavatar_jax.training import step as step_module
+from xavatar_jax.training.loop import train_pool
+from xavatar_jax.training.pool import find_roots, label_frames, polish_roots, tabulate_for_search
+from xavatar_jax.training.progress import progress
+from xavatar_jax.training.step import draw_batch
+
+
+def tiny(config: xa.FitConfig) -> xa.FitConfig:
+    coarse = GridSpacing(body=0.04, hands=0.01, face=0.013, band=0.06)
+    points = replace(config.points, body=200, face=60, eyes_mouth=40, hand=100, box=20)
+    return replace(
+        config,
+        steps=12,
+        frames_per_step=2,
+        points_per_step=64,
+        train_frames=3,
+        points=points,
+        skinning=replace(config.skinning, grid=coarse, mlp=replace(config.skinning.mlp, width=32)),
+        search=replace(config.search, grid=coarse),
+    )
+
+
+@pytest.fixture(scope="module")
+def case():
+    body = xa.synthetic_body()
+    rng = np.random.default_rng(3)
+    pose = np.deg2rad(10) * rng.standard_normal((3, 55, 3))
+    frames = frames_from_params(body, xa.BodyParams.create(body, pose=pose))
+    config = tiny(xa.quick())
+    fields = fresh_fields(body, config)
+    with progress("", 3, verbose=False) as bar:
+        pool = label_frames(body, frames, config, bar=bar)
+        pool = find_roots(body, fields.skinning, pool, config, bar=bar)
+    return body, frames, config, fields, pool
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_config_survives_json(preset):
+    config = PRESETS[preset]()
+    assert config_from_dict(json.loads(json.dumps(config_to_dict(config)))) == config
+
+
+def test_unknown_config_entry_is_named():
+    values = config_to_dict(xa.quick())
+    values["search"]["speed"] = 11
+    with pytest.raises(ValueError, match=r"config\.search: unknown entry 'speed'"):
+        config_from_dict(values)
+
+
+def test_roots_of_the_pool_are_roots(case):
+    """Skinning carries every stored root to its point, to the grid's own accuracy."""
+    body, _, config, fields, pool = case
+    table = tabulate_for_search(body, fields.skinning, config)
+    for k in range(3):
+        found = int(pool.found[k])
+        assert found > 0.9 * pool.points.shape[1]
+        posed = jax.vmap(lambda x, b=pool.transforms[k]: xa.skin_points(x, table(x), b))(
+            pool.root[k, :found]
+        )
+        assert np.abs(posed - pool.points[k, :found]).max() < 2e-5
+
+
+def test_polished_roots_belong_to_the_field_itself(case):
+    body, _, config, fields, pool = case
+    table = tabulate_for_search(body, fields.skinning, config)
+    polished = polish_roots(fields.skinning, table, pool, steps=3)
+    found = int(pool.found.min())
+
+    def gap(p):
+        posed = jax.vmap(lambda x: xa.skin_points(x, fields.skinning(x), pool.transforms[0]))(
+            p.root[0, :found]
+        )
+        return np.linalg.norm(posed - pool.points[0, :found], axis=1)
+
+    assert np.quantile(gap(polished), 0.98) < 1e-5
+    assert np.median(gap(polished)) <= np.median(gap(pool))
+
+
+def test_batches_take_only_points_with_roots(case):
+    _, _, config, _, pool = case
+    batch = draw_batch(pool, config, 64, 8, jax.random.key(0))
+    known = np.asarray(pool.points).reshape(-1, 3)
+    rows = [np.flatnonzero((known == p).all(1))[0] for p in np.asarray(batch.points[0])]
+    frame, row = np.divmod(rows, pool.points.shape[1])
+    assert (row < np.asarray(pool.found)[frame]).all()
+    assert batch.others.shape[:2] == (2, 8)
+
+
+def test_same_seed_same_numbers(case):
+    body, _, config, fields, pool = case
+    betas = np.zeros(10)
+    first, second = (
+        train_pool(body, fields, pool, betas, config, verbose=False).fields for _ in range(2)
+    )
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        assert np.array_equal(a, b)
+
+
+def test_only_learned_leaves_change(case):
+    body, _, config, fields, pool = case
+    after = train_pool(body, fields, pool, np.zeros(10), config, verbose=False).fields
+    learned = trainable_filter(fields, config)
+    fixed_before = jax.tree.leaves(eqx.filter(fields, learned, inverse=True))
+    fixed_after = jax.tree.leaves(eqx.filter(after, learned, inverse=True))
+    for a, b in zip(fixed_before, fixed_after, strict=True):
+        assert np.array_equal(a, b)
+    assert not np.array_equal(fields.geometry.encoding.table, after.geometry.encoding.table)
+    assert not np.array_equal(fields.skinning.correction, after.skinning.correction)
+
+
+def test_fixed_template_weights_stay(case):
+    body, _, config, fields, pool = case
+    config = replace(config, skinning=replace(config.skinning, learned=False))
+    after = train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
+    assert np.array_equal(fields.skinning.correction, after.fields.skinning.correction)
+    assert not any(name.startswith("skinning") for name in after.history.terms)
+
+
+def test_steps_are_traced_once(case, monkeypatch):
+    body, _, config, fields, pool = case
+    traces = {"geometry": 0, "skinning": 0}
+
+    def counted(name, objective):
+        def wrapped(*args):
+            traces[name] += 1
+            return objective(*args)
+
+        return wrapped
+
+    for name in traces:
+        attribute = f"{name}_objective"
+        monkeypatch.setattr(step_module, attribute, counted(name, getattr(step_module, attribute)))
+    train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
+    assert traces == {"geometry": 1, "skinning": 1}
+
+
+def test_a_loss_that_is_not_finite_names_its_term(case):
+    body, _, config, fields, pool = case
+    bad = eqx.tree_at(lambda p: p.distance, pool, jnp.full_like(pool.distance, jnp.nan))
+    with pytest.raises(TrainingError, match="occupancy term is nan at step 12"):
+        train_pool(body, fields, bad, np.zeros(10), config, verbose=False)
+
+
+def test_a_budget_of_seconds_ends_training(case):
+    body, _, config, fields, pool = case
+    config = replace(config, steps=100_000)
+    done = train_pool(body, fields, pool, np.zeros(10), config, seconds=0.5, verbose=False)
+    assert done.history.steps_done < 5000
+
+
+@pytest.mark.slow
+def test_paper_preset_takes_a_step(case):
+    """Its networks, narrower, with roots searched inside the step on the network itself."""
+    body, frames, _, _, _ = case
+    config = tiny(xa.paper())
+    config = replace(
+        config,
+        steps=2,
+        geometry=replace(config.geometry, mlp=MLPShape(width=48)),
+        search=replace(config.search, keep=3),
+    )
+    fields = fresh_fields(body, config)
+    with progress("", 3, verbose=False) as bar:
+        pool = label_frames(body, frames, config, bar=bar)
+    done = train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
+    terms = {name: values[-1] for name, values in done.history.terms.items()}
+    assert set(terms) == {"loss", "occupancy", "bone", "joint", "surface", "found"}
+    assert all(np.isfinite(value) for value in terms.values())
+    assert terms["found"] > 0.9
+
+
+def test_frames_of_another_body_are_refused(case):
+    body, frames, config, _, _ = case
+    params = eqx.tree_at(lambda p: p.betas, frames.params, jnp.zeros((3, 40)))
+    wrong = xa.Frames(params, lambda i: (frames[i].vertices, frames[i].faces))
+    with pytest.raises(ValueError, match=r"frames\.params\.betas has shape \(3, 40\)"):
+        xa.fit(wrong, config, body=body, verbose=False)
