@@ -114,9 +114,7 @@ def main(options: Options) -> None:
             f"frames, {body.num_vertices} vertices, {body.source.describe()}",
             flush=True,
         )
-    result = xa.fit(
-        capture.train, configure(options), body=body, cache=options.cache_dir, verbose=verbose
-    )
+    result = xa.fit(capture.train, configure(options), cache=options.cache_dir, verbose=verbose)
     avatar, history = result
     avatar.save(out / "avatar.npz")
     fitted = time.perf_counter()

@@ -136,7 +136,7 @@ def test_the_residual_belongs_to_the_iterate_returned(x64, steps, start):
 
 
 def test_wrong_uses_are_refused():
-    with pytest.raises(ValueError, match="as many equations as unknowns: 2 against 3"):
+    with pytest.raises(ValueError, match="as many equations as unknowns: 2 .* 3"):
         optx.root_find(lambda y, a: y[:2], Broyden(), jnp.ones(3))
     with pytest.raises(ValueError, match=r"inverse_jacobian.*\(2, 2\), expected \(3, 3\)"):
         optx.root_find(

@@ -36,15 +36,16 @@ def fit(
     frames: Frames,
     config: FitConfig | None = None,
     *,
-    body: BodyModel,
+    body: BodyModel | None = None,
     cache: str | os.PathLike[str] | None = None,
     verbose: bool = True,
     callback: Callable[[int, AvatarFields, dict[str, float]], None] | None = None,
 ) -> Fit:
     """Learn an avatar of the person in `frames`.
 
-    `avatar, history = fit(frames, body=body)` learns with the quick preset; `config` may be any
-    other (`paper()`, or either with entries replaced). The person's one shape is the mean of the
+    `avatar, history = fit(frames)` learns with the quick preset; `config` may be any other
+    (`paper()`, or either with entries replaced). `body` is the model that the parameters are for;
+    frames from our loaders know it. The person's one shape is the mean of the
     frames' betas. `cache` overrides the cache folder of the fields fitted to the body's mean
     shape; `verbose=False` is quiet.
 
@@ -52,6 +53,11 @@ def fit(
     `TrainingError` if a loss is not finite.
     """
     config = quick() if config is None else config
+    body = frames.body if body is None else body
+    if body is None:
+        raise ValueError(
+            "these frames do not say which body they are for: pass body=load_body(...)"
+        )
     betas = subject_betas(frames)
     fitted = fit_fields(
         body, frames, betas, config, cache=cache, verbose=verbose, callback=callback

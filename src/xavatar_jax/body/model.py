@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -204,7 +205,11 @@ def with_template(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> BodyMo
         )
     template = jnp.asarray(vertices, body.template.dtype)
     joints = jnp.matmul(body.joint_regressor, template, precision=_PRECISION)
-    return eqx.tree_at(lambda b: (b.template, b.joint_template), body, (template, joints))
+    # Another template is another body: an avatar learned on it must not load on the plain model.
+    digest = hashlib.sha256(body.source.checksum.encode())
+    digest.update(np.ascontiguousarray(vertices, np.float32).tobytes())
+    source = replace(body.source, checksum=digest.hexdigest())
+    return replace(body, template=template, joint_template=joints, source=source)
 
 
 def _combine(

@@ -71,7 +71,6 @@ def find_correspondences(
         raise ValueError(f"transforms have shape {transforms.shape}, expected (J, 4, 4)")
     check_bones(init_bones, transforms.shape[0])
     solver = Broyden(atol=1e-5, divergence=DIVERGENCE) if solver is None else solver
-    adjoint = optx.ImplicitAdjoint() if adjoint is None else adjoint
     bones = np.asarray(init_bones)
     dynamic, static = eqx.partition(field, eqx.is_array)
 
@@ -90,19 +89,33 @@ def find_correspondences(
             residual,
             solver,
             start,
-            args,
+            jax.lax.stop_gradient(args) if adjoint is None else args,
             options,
             max_steps=max_steps,
-            adjoint=adjoint,
+            adjoint=optx.ImplicitAdjoint() if adjoint is None else adjoint,
             throw=throw,
         )
         # Masked here, inside the mapped function: derivatives of a failed solve would be finite
         # and wrong.
         ok = solution.result == optx.RESULTS.successful
         x_c = jnp.where(ok, solution.value, jax.lax.stop_gradient(solution.value))
+        if adjoint is None:
+            x_c = with_derivatives(x_c, ok)
         error = residual(jax.lax.stop_gradient(x_c), jax.lax.stop_gradient(args))
         found = ok & field.covers(jax.lax.stop_gradient(x_c))
         return x_c, jnp.sqrt(jnp.sum(error**2)), found, solution.result, solution.stats["num_steps"]
+
+    def with_derivatives(root: Array, ok: Array) -> Array:
+        # A linear solver would raise at a start that met NaN or a fold: those lanes stand in with
+        # a harmless point and pass on nothing.
+        place = jnp.where(ok, jax.lax.stop_gradient(root), 0.0)
+        safe_args = (dynamic, transforms, jnp.where(ok, x_d, 0.0))
+        error = residual(place, safe_args)
+        jacobian = jax.jacfwd(residual)(place, jax.lax.stop_gradient(safe_args))
+        usable = ok & jnp.all(jnp.isfinite(inverse_3x3(jacobian)))
+        inverse = inverse_3x3(jnp.where(usable, jacobian, jnp.eye(3, dtype=jacobian.dtype)))
+        step = (inverse * (error - jax.lax.stop_gradient(error))).sum(-1)
+        return jnp.where(usable, place - step, root)
 
     starts = jax.lax.stop_gradient(pull_back(x_d, transforms[bones]))
     return Correspondences(*jax.vmap(solve)(starts))

@@ -77,6 +77,7 @@ def mesh_frames(
         lambda i: read_mesh(meshes[i]),
         part_labels=labels,
         sources=[str(mesh) for mesh in meshes],
+        body=body,
         sequence_names=names,
         sequence_index=np.array([names.index(s) for s in sequences]),
     )

@@ -57,8 +57,8 @@ class MLPShape:
 class ImplicitMLP(eqx.Module):
     """`depth` hidden layers on an encoded point, with a linearly embedded condition.
 
-    A skip layer reads $[h, \\gamma(x)]/\\sqrt2$, and the layer before it is narrower by the width of
-    $\\gamma(x)$. `init="ball"` starts as a ball of radius about one, positive inside (Atzmon &
+    A skip layer reads $[h, \\gamma(x)]/\\sqrt2$, and the layer before it is narrower by the width
+    of $\\gamma(x)$. `init="ball"` starts as a ball of radius about one, positive inside (Atzmon &
     Lipman, 2020), with octaves and condition silent; `"default"` draws uniformly by fan-in.
     """
 

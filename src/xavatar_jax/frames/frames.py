@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, Int8
 
-from ..body import BodyParams
+from ..body import BodyModel, BodyParams
 from ..files.meshes import check_mesh, read_mesh
 
 LoadMesh = Callable[[int], tuple[np.ndarray, np.ndarray]]
@@ -46,6 +46,7 @@ class _Sources:
     names: tuple[str, ...]
     sequence_names: tuple[str, ...]
     sequence_index: np.ndarray = field(repr=False)
+    body: BodyModel | None
 
 
 class Frames(Sequence[Frame]):
@@ -61,6 +62,7 @@ class Frames(Sequence[Frame]):
         sources: a name for each frame, used in messages.
         sequence_names: names of the sequences the frames come from.
         sequence_index: for each frame, which of `sequence_names` it belongs to.
+        body: the body that the parameters are for, where it is known.
 
     Raises:
         ValueError: no frames, counts that do not match, or parameters that are not finite.
@@ -75,6 +77,7 @@ class Frames(Sequence[Frame]):
         sources: Sequence[str] | None = None,
         sequence_names: Sequence[str] = ("sequence",),
         sequence_index: Int[np.ndarray, " N"] | Sequence[int] | None = None,
+        body: BodyModel | None = None,
     ):
         count = _batch_size(params)
         names = tuple(sources) if sources is not None else _numbered(count)
@@ -84,7 +87,7 @@ class Frames(Sequence[Frame]):
         labels = part_labels
         if labels is not None and not callable(labels):
             labels = np.asarray(labels, np.int8)
-        self._sources = _Sources(load, labels, names, tuple(sequence_names), index)
+        self._sources = _Sources(load, labels, names, tuple(sequence_names), index, body)
         self._params = params
         self._index = np.arange(count)
 
@@ -98,6 +101,7 @@ class Frames(Sequence[Frame]):
         sources: Sequence[str] | None = None,
         sequence_names: Sequence[str] = ("sequence",),
         sequence_index: Int[np.ndarray, " N"] | Sequence[int] | None = None,
+        body: BodyModel | None = None,
     ) -> Frames:
         """Frames from meshes: `(vertices, faces)` pairs, objects with both, or file paths.
 
@@ -107,7 +111,7 @@ class Frames(Sequence[Frame]):
         Args:
             meshes: N meshes, vertices in metres.
             params: body parameters batched over the N meshes.
-            part_labels, sources, sequence_names, sequence_index: as for `Frames`.
+            part_labels, sources, sequence_names, sequence_index, body: as for `Frames`.
 
         Raises:
             ValueError: another number of meshes than of parameters, or as for `Frames`.
@@ -127,7 +131,13 @@ class Frames(Sequence[Frame]):
             sources=sources,
             sequence_names=sequence_names,
             sequence_index=sequence_index,
+            body=body,
         )
+
+    @property
+    def body(self) -> BodyModel | None:
+        """The body that the parameters are for, or None where it was not given."""
+        return self._sources.body
 
     @property
     def params(self) -> BodyParams:

@@ -54,6 +54,7 @@ def frames_from_params(
         sources=sources,
         sequence_names=sequence_names,
         sequence_index=sequence_index,
+        body=body,
     )
 
 
