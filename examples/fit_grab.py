@@ -127,7 +127,7 @@ def main(options: Options) -> None:
     names = list(capture.test.sequences)
     sequence = capture.test.sequences[names[0]]
     save_png(out / "preview.png", preview(avatar, capture.test[len(capture.test) // 2]))
-    save_webp_animation(animation(avatar, sequence), out / "animation.webp", fps=12)
+    save_webp_animation(animation(avatar, sequence), out / "animation.webp", fps=10)
     written += [out / "preview.png", out / "animation.webp"]
     finished = time.perf_counter()
     stages = history.seconds

@@ -1,4 +1,4 @@
-"""Shared by the tests: tolerances with their reasons, small bodies, an analytic arm, differences."""
+"""Shared by the tests: tolerances with reasons, small bodies, an analytic arm, differences."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def two_bone_arm(bend: Any, sharpness: Any = 20.0) -> tuple[ArmField, jax.Array]
 def arm_skin(x: np.ndarray, bend: float, sharpness: float = 20.0) -> np.ndarray:
     """The arm's skinning map in plain NumPy, `(N, 3)` points."""
     x = np.asarray(x, np.float64)
-    second = (1 / (1 + np.exp(-sharpness * x[:, :1])))
+    second = 1 / (1 + np.exp(-sharpness * x[:, :1]))
     turned = Rotation.from_rotvec([0, 0, bend]).apply(x)
     return (1 - second) * x + second * turned
 
@@ -194,4 +194,6 @@ def central_difference(
 
 
 def all_finite(tree: Any) -> bool:
-    return all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(eqx.filter(tree, eqx.is_array)))
+    return all(
+        bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(eqx.filter(tree, eqx.is_array))
+    )

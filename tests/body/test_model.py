@@ -163,7 +163,7 @@ def test_canonical_pose_of_the_family(family):
     assert not np.asarray(canonical_pose(family["mano"])).any()
 
 
-@pytest.mark.parametrize("kind", PARENTS)
+@pytest.mark.parametrize("kind", ["smplx", "mano"])
 def test_bones_map_the_canonical_body_to_the_posed_one(family, rng, kind):
     """Joints, which are rigid, land where posing puts them; so do one-bone vertices."""
     body = family[kind]
@@ -217,7 +217,9 @@ def test_a_subjects_template(family, family_arrays, rng):
         changed, *(np.asarray(x) for x in (params.betas, params.pose, params.transl)),
         expression=np.asarray(params.expression),
     )  # fmt: skip
-    np.testing.assert_allclose(jax.jit(pose_body)(own, params).vertices, vertices, atol=TOLERANCE["body_m"])
+    np.testing.assert_allclose(
+        jax.jit(pose_body)(own, params).vertices, vertices, atol=TOLERANCE["body_m"]
+    )
     with pytest.raises(ValueError, match=r"\(89, 3\), expected \(90, 3\)"):
         with_template(body, template[1:])
 

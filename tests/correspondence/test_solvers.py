@@ -50,9 +50,8 @@ def solve(name, **kwargs):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize("jit", [False, True])
-def test_roots(x64, name, jit):
-    run = jax.jit(lambda: solve(name).value) if jit else (lambda: solve(name).value)
+def test_roots(x64, name):
+    run = jax.jit(lambda: solve(name).value)
     for found, expected in zip(
         jax.tree.leaves(run()), jax.tree.leaves(PROBLEMS[name][3]), strict=True
     ):
@@ -122,21 +121,27 @@ def test_failures_are_values_with_a_cause(x64, fn, start, solver, max_steps, cau
         jax.block_until_ready(optx.root_find(fn, solver, y, args, max_steps=max_steps).value)
 
 
-@pytest.mark.parametrize("steps", [3, 10, 40])
-@pytest.mark.parametrize("start", [0.3, 0.9, 2.0])
-def test_the_residual_belongs_to_the_iterate_returned(x64, steps, start):
+@pytest.mark.parametrize("steps", [3, 40])
+def test_the_residual_belongs_to_the_iterate_returned(x64, steps):
     """x^2 + 0.05 has no root: the last iterate must not come with the best residual."""
-    found = optx.root_find(
-        no_root, Broyden(atol=1e-8), jnp.array([start]), jnp.array(0.05),
-        max_steps=steps, throw=False,
-    )  # fmt: skip
-    assert found.result != optx.RESULTS.successful
-    expected = float(found.value[0]) ** 2 + 0.05
-    np.testing.assert_allclose(found.stats["residual_norm"], expected, rtol=1e-12)
+    solver = Broyden(atol=1e-8)
+
+    @jax.jit
+    def run(start):
+        found = optx.root_find(
+            no_root, solver, start, jnp.array(0.05), max_steps=steps, throw=False
+        )
+        good = found.result == optx.RESULTS.successful
+        return found.value[0], found.stats["residual_norm"], good
+
+    for start in (0.3, 0.9, 2.0):
+        value, residual, good = run(jnp.array([start]))
+        assert not bool(good)
+        np.testing.assert_allclose(residual, float(value) ** 2 + 0.05, rtol=1e-12)
 
 
 def test_wrong_uses_are_refused():
-    with pytest.raises(ValueError, match="as many equations as unknowns: 2 .* 3"):
+    with pytest.raises(ValueError, match=r"as many equations as unknowns: 2 .* 3"):
         optx.root_find(lambda y, a: y[:2], Broyden(), jnp.ones(3))
     with pytest.raises(ValueError, match=r"inverse_jacobian.*\(2, 2\), expected \(3, 3\)"):
         optx.root_find(
@@ -169,7 +174,9 @@ def test_newton_steps_are_cut():
     """From far away a step is no longer than `max_step`."""
     solver = ClosedFormNewton(atol=1e-9, max_step=0.1)
     fn = lambda y, a: (y, jnp.eye(3))  # noqa: E731
-    found = optx.root_find(fn, solver, jnp.array([1.0, 0, 0]), has_aux=True, max_steps=4, throw=False)
+    found = optx.root_find(
+        fn, solver, jnp.array([1.0, 0, 0]), has_aux=True, max_steps=4, throw=False
+    )
     np.testing.assert_allclose(found.value, [0.6, 0, 0], atol=1e-6)
     done = optx.root_find(fn, solver, jnp.array([1.0, 0, 0]), has_aux=True, max_steps=20)
     np.testing.assert_allclose(done.value, 0, atol=1e-6)

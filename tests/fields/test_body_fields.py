@@ -56,16 +56,17 @@ def test_grids_around_the_body(bundled_body, vertices, rng):
 def test_template_skinning_near_the_surface(bundled_body, vertices, skinning, rng):
     pick = rng.integers(0, len(vertices), 400)
     points = jnp.asarray(vertices[pick], jnp.float32)
-    found = np.asarray(jax.jit(jax.vmap(skinning))(points))
+    found = np.asarray(eqx.filter_jit(lambda f, x: jax.vmap(f)(x))(skinning, points))
     np.testing.assert_allclose(found.sum(1), 1.0, atol=1e-5)
     assert np.abs(found - np.asarray(bundled_body.weights)[pick]).max(1).mean() < 0.1
-    assert bool(jax.vmap(skinning.covers)(points).all())
+    assert bool(skinning.grids.covers(points).all())
     assert not bool(skinning.covers(jnp.array([0.0, 5.0, 0.0])))
 
 
 def test_the_correction_learns_and_the_template_does_not(skinning, vertices):
     points = jnp.asarray(vertices[:40], jnp.float32)
-    slope = eqx.filter_grad(lambda f: jnp.sum(jax.vmap(f)(points)[:, 15] ** 2))(skinning)
+    loss = eqx.filter_grad(lambda f: jnp.sum(jax.vmap(f)(points)[:, 15] ** 2))
+    slope = eqx.filter_jit(loss)(skinning)
     assert not np.asarray(slope.template).any()
     assert np.isfinite(slope.correction).all()
 
@@ -138,7 +139,9 @@ def test_fine_levels_are_heard_inside_their_boxes_alone(geometry):
     np.testing.assert_allclose(middle, np.ones(len(levels)), atol=1e-6)
     outside = geometry._level_mask(jnp.asarray(high + 0.01, jnp.float32))
     np.testing.assert_array_equal(outside, [1, 1, 1, 0])
-    border = geometry._level_mask(jnp.asarray([low[0] + 0.01, *((low + high) / 2)[1:]], jnp.float32))
+    border = geometry._level_mask(
+        jnp.asarray([low[0] + 0.01, *((low + high) / 2)[1:]], jnp.float32)
+    )
     np.testing.assert_allclose(border, [1, 1, 1, 0.5], atol=1e-4)
 
 

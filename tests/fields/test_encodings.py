@@ -48,7 +48,7 @@ def test_a_dense_level_interpolates_trilinearly(x64, rng):
     assert all(shape is not None for shape in encoding.shapes)
     assert encoding.width == 4
     points = rng.uniform([-0.2, -0.1, 0.0], [0.2, 0.3, 0.3], (50, 3))
-    found = jax.vmap(encoding)(jnp.asarray(points))
+    found = jax.jit(jax.vmap(lambda p: encoding(p)))(points)
     for level, h in enumerate(encoding.spacing):
         shape, start = encoding.shapes[level], encoding.offsets[level]
         values = np.asarray(encoding.table[start : start + np.prod(shape)]).reshape(*shape, 2)
@@ -87,7 +87,7 @@ def test_features_are_continuous_across_cells(x64, rng, log2_size):
     on_face[np.arange(60), axis] = 0.1 * rng.integers(1, 9, 60)
     step = np.zeros((60, 3))
     step[np.arange(60), axis] = 1e-9
-    run = jax.vmap(encoding)
+    run = jax.jit(jax.vmap(lambda p: encoding(p)))
     before, after = run(jnp.asarray(on_face - step)), run(jnp.asarray(on_face + step))
     np.testing.assert_allclose(before, after, atol=1e-6)
 
@@ -102,9 +102,9 @@ def test_outside_the_box_the_border_answers(rng):
 def test_gradient_in_the_point_and_in_the_table(x64, rng):
     encoding = dense_encoding(rng)
     x = np.array([0.013, 0.127, 0.211])
-    found = jax.jacrev(encoding)(jnp.asarray(x))
-    expected = central_difference(lambda v: encoding(jnp.asarray(v)), x)
+    found = jax.jit(jax.jacrev(lambda v: encoding(v)))(x)
+    expected = central_difference(jax.jit(lambda v: encoding(v)), x)
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    slope = jax.grad(lambda e: jnp.sum(e(jnp.asarray(x))))(encoding)
+    slope = jax.jit(jax.grad(lambda e: jnp.sum(e(jnp.asarray(x)))))(encoding)
     # Interpolation weights of each level sum to one, for each of the two features.
     np.testing.assert_allclose(jnp.sum(slope.table), 4.0, atol=1e-12)

@@ -96,19 +96,20 @@ def test_weights_sum_to_one_in_single_precision(kind, rng):
     sizes = np.repeat([0.1, 1.0, 10.0, 100.0], 250)[:, None]
     logits = (sizes * rng.normal(size=(1000, num_logits(TREES[kind])))).astype(np.float32)
     weights = np.asarray(
-        jax.jit(hierarchical_softmax, static_argnums=0)(TREES[kind], jnp.asarray(logits)), np.float64
+        jax.jit(hierarchical_softmax, static_argnums=0)(TREES[kind], jnp.asarray(logits)),
+        np.float64,
     )
     assert weights.min() >= 0
     np.testing.assert_allclose(weights.sum(1), 1.0, atol=TOLERANCE["sum_to_one"])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(trees(), st.integers(0, 2**31))
 def test_weights_of_any_tree(parents, seed):
     tree = KinematicTree(tuple(f"j{k}" for k in range(len(parents))), parents)
     gates, count = gates_of(parents)
     assert num_logits(tree) == count
-    logits = 3 * np.random.default_rng(seed).normal(size=(3, count))
+    logits = 3 * np.random.default_rng(seed).normal(size=(4, count))
     expected = np.stack([reference(parents, gates, row) for row in logits])
     with jax.enable_x64(True):
         found = jax.jit(hierarchical_softmax, static_argnums=0)(tree, jnp.asarray(logits))

@@ -27,6 +27,15 @@ SPACING = GridSpacing(body=0.02, hands=0.005, face=0.01, band=0.06, fine_band=0.
 READ = 5e-5
 
 
+# Compiled once a shape: one operation after another would compile each of them.
+interpolate = eqx.filter_jit(lambda grids, values, x: grids.interpolate(values, x))
+with_gradient = eqx.filter_jit(lambda grids, values, x: grids.interpolate_with_gradient(values, x))
+covers = eqx.filter_jit(lambda grids, x: grids.covers(x))
+locate = eqx.filter_jit(lambda grids, x: grids.locate(x))
+blend = eqx.filter_jit(lambda grids, values: grids.blend(values))
+read = eqx.filter_jit(lambda field, x: jax.vmap(field)(x))
+
+
 def stick_figure(rng):
     """A trunk of radius 8 cm with a ball for a hand at its end, and a face on its side."""
     trunk = rng.normal(size=(1500, 3))
@@ -35,7 +44,7 @@ def stick_figure(rng):
     hand = rng.normal(size=(400, 3))
     hand *= 0.03 / np.linalg.norm(hand, axis=1, keepdims=True)
     hand[:, 0] += 0.3
-    face = rng.uniform(-0.02, 0.02, (200, 3)) + [-0.2, 0.1, 0.0]
+    face = rng.uniform(-0.02, 0.02, (200, 3)) + np.array([-0.2, 0.1, 0.0])
     labels = np.repeat([0, 2, 1], [1500, 400, 200])
     return np.concatenate([trunk, hand, face]), labels
 
@@ -62,7 +71,7 @@ def inside(grids, figure):
     vertices, _ = figure
     points = vertices[rng.integers(0, len(vertices), 3000)] + 0.012 * rng.normal(size=(3000, 3))
     points = jnp.asarray(points, jnp.float32)
-    covered = grids.covers(points)
+    covered = covers(grids, points)
     assert covered.mean() > 0.99
     return points[covered]
 
@@ -94,26 +103,26 @@ def test_spacing_is_rounded_down_to_a_fraction_of_the_coarse_one(figure):
 
 def test_vertices_are_covered_and_far_points_are_not(grids, figure):
     vertices, labels = figure
-    assert bool(grids.covers(jnp.asarray(vertices, jnp.float32)).all())
+    assert bool(covers(grids, jnp.asarray(vertices, jnp.float32)).all())
     far = jnp.array([[5.0, 0, 0], [0, 0.35, 0], [-0.6, 0, 0], [0.0, 0.0, -9.0]])
-    assert not bool(grids.covers(far).any())
-    assert not bool(grids.covers(jnp.full(3, jnp.nan)))
+    assert not bool(covers(grids, far).any())
+    assert not bool(covers(grids, jnp.full(3, jnp.nan)))
     # Whoever asks there still gets numbers: those of the nearest stored cell.
-    assert np.isfinite(grids.interpolate(grids.nodes, far)).all()
+    assert np.isfinite(interpolate(grids, grids.nodes, far)).all()
     # Points inside each fine box are read from its own, finer cells.
-    _, _, spacing = grids.locate(jnp.asarray(vertices[labels == 2], jnp.float32))
+    _, _, spacing = locate(grids, jnp.asarray(vertices[labels == 2], jnp.float32))
     np.testing.assert_allclose(spacing, 0.005, rtol=1e-6)
 
 
-@pytest.mark.parametrize("blend", [False, True])
-def test_linear_functions_come_back_exactly(grids, inside, rng, blend):
+@pytest.mark.parametrize("blended", [False, True])
+def test_linear_functions_come_back_exactly(grids, inside, rng, blended):
     slope, shift = rng.normal(size=(3, 4)), rng.normal(size=4)
     linear = lambda p: jnp.asarray(p) @ jnp.asarray(slope, jnp.float32) + shift  # noqa: E731
     values = linear(grids.nodes)
-    values = grids.blend(values) if blend else values
-    found, gradient = grids.interpolate_with_gradient(values, inside)
+    values = blend(grids, values) if blended else values
+    found, gradient = with_gradient(grids, values, inside)
     np.testing.assert_allclose(found, linear(inside), atol=2e-6)
-    np.testing.assert_allclose(grids.interpolate(values, inside), found, atol=1e-6)
+    np.testing.assert_allclose(interpolate(grids, values, inside), found, atol=1e-6)
     expected = np.broadcast_to(slope.T, gradient.shape)
     np.testing.assert_allclose(gradient, expected, atol=1e-3)  # float32 differences over 5 mm
 
@@ -127,7 +136,7 @@ def test_no_jump_across_the_borders_of_fine_boxes(grids, rng):
     """A step of a micrometre across a face changes random values by a step's worth, no more."""
     blended, raw = [], []
     values = random_values(grids, rng)
-    smooth = grids.blend(values)
+    smooth = blend(grids, values)
     for low, high in boxes(grids):
         for axis in range(3):
             for side in (low, high):
@@ -136,9 +145,9 @@ def test_no_jump_across_the_borders_of_fine_boxes(grids, rng):
                 step = 1e-6 * np.eye(3)[axis]
                 before = jnp.asarray(on_face - step, jnp.float32)
                 after = jnp.asarray(on_face + step, jnp.float32)
-                both = np.asarray(grids.covers(before) & grids.covers(after))
+                both = np.asarray(covers(grids, before) & covers(grids, after))
                 for jumps, v in ((blended, smooth), (raw, values)):
-                    jump = jnp.abs(grids.interpolate(v, before) - grids.interpolate(v, after))
+                    jump = jnp.abs(interpolate(grids, v, before) - interpolate(grids, v, after))
                     jumps.append(np.asarray(jump.max(-1))[both])
     blended, raw = np.concatenate(blended), np.concatenate(raw)
     assert len(blended) > 200
@@ -148,14 +157,14 @@ def test_no_jump_across_the_borders_of_fine_boxes(grids, rng):
 
 
 def test_no_jump_between_cells_of_one_grid(grids, inside, rng):
-    values = grids.blend(random_values(grids, rng))
+    values = blend(grids, random_values(grids, rng))
     points = np.asarray(inside, np.float64)
-    cell, _, spacing = grids.locate(inside)
+    cell, _, spacing = locate(grids, inside)
     step = np.asarray(spacing)[:, None] * 1e-3 * rng.normal(size=points.shape)
     moved = jnp.asarray(points + step, jnp.float32)
-    both = np.asarray(grids.covers(moved))
-    change = np.abs(grids.interpolate(values, moved) - grids.interpolate(values, inside)).max(-1)
-    crossed = np.asarray(grids.locate(moved)[0] != cell)
+    both = np.asarray(covers(grids, moved))
+    change = np.abs(interpolate(grids, values, moved) - interpolate(grids, values, inside)).max(-1)
+    crossed = np.asarray(locate(grids, moved)[0] != cell)
     # A thousandth of a cell changes values by a few thousandths of their range, crossing or not.
     assert (crossed & both).sum() > 5
     assert change[both].max() < 0.05
@@ -163,7 +172,7 @@ def test_no_jump_between_cells_of_one_grid(grids, inside, rng):
 
 def test_blending_leaves_nodes_far_inside_alone(grids, rng):
     values = random_values(grids, rng)
-    blended = grids.blend(values)
+    blended = blend(grids, values)
     changed = np.asarray(jnp.any(blended != values, -1))
     nodes = np.asarray(grids.nodes)
     near_border = np.zeros(len(nodes), bool)
@@ -177,21 +186,21 @@ def test_blending_leaves_nodes_far_inside_alone(grids, rng):
 
 
 def test_slopes_agree_with_differences(grids, inside, rng):
-    values = grids.blend(random_values(grids, rng))
-    _, fraction, spacing = grids.locate(inside)
+    values = blend(grids, random_values(grids, rng))
+    _, fraction, spacing = locate(grids, inside)
     well_inside = np.asarray(jnp.all((fraction > 0.1) & (fraction < 0.9), -1))
     points = np.asarray(inside)[well_inside][:300]
     h = 0.05 * np.asarray(spacing)[well_inside][:300, None]
-    _, slope = grids.interpolate_with_gradient(values, jnp.asarray(points))
+    _, slope = with_gradient(grids, values, jnp.asarray(points))
     scale = np.abs(slope).max()
     for axis in range(3):
         step = h * np.eye(3, dtype=np.float32)[axis]
-        up = grids.interpolate(values, jnp.asarray(points + step))
-        down = grids.interpolate(values, jnp.asarray(points - step))
+        up = interpolate(grids, values, jnp.asarray(points + step))
+        down = interpolate(grids, values, jnp.asarray(points - step))
         # A trilinear function is linear along an axis: the difference is exact.
         difference = (up - down) / (2 * h)
         np.testing.assert_allclose(slope[..., axis], difference, atol=2e-3 * scale)
-    automatic = jax.vmap(jax.jacfwd(lambda x: grids.interpolate(values, x)))(jnp.asarray(points))
+    automatic = jax.jit(jax.vmap(jax.jacfwd(lambda x: grids.interpolate(values, x))))(points)
     np.testing.assert_allclose(slope, automatic, atol=1e-4 * scale)
 
 
@@ -201,9 +210,7 @@ def test_interpolation_weights_of_a_cell(x64, rng):
     corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     np.testing.assert_allclose(weights.sum(1), 1.0, atol=1e-14)
     np.testing.assert_allclose(weights @ corners, fraction, atol=1e-14)
-    expected = np.stack(
-        [central_difference(lambda f: lerp_weights(jnp.asarray(f)), f) for f in fraction]
-    )
+    expected = np.stack([central_difference(jax.jit(lerp_weights), f) for f in fraction])
     np.testing.assert_allclose(lerp_slopes(jnp.asarray(fraction)), expected, atol=1e-9)
 
 
@@ -229,14 +236,14 @@ def some_transforms(rng, count=3, spread=0.5):
 
 
 def test_a_table_holds_the_fields_values_at_the_nodes(grids, mlp_field, table):
-    expected = np.array(jax.vmap(mlp_field)(grids.nodes))
+    expected = np.array(read(mlp_field, grids.nodes))
     own = np.setdiff1d(np.arange(grids.num_nodes), np.asarray(grids.blend_nodes))
     np.testing.assert_allclose(table.node_weights[own], expected[own], atol=1e-6)
     np.testing.assert_allclose(table.node_weights.sum(1), 1.0, atol=1e-5)
 
 
 def test_a_table_reads_close_to_a_smooth_field(mlp_field, table, inside):
-    found, expected = jax.vmap(table)(inside), jax.vmap(mlp_field)(inside)
+    found, expected = read(table, inside), read(mlp_field, inside)
     assert np.abs(found - expected).max() < 5e-3  # h^2/8 times the field's curvature
 
 
@@ -244,35 +251,36 @@ def test_blending_transforms_commutes_with_interpolation(table, inside, rng):
     """Twelve numbers a node, or weights first: the same point."""
     transforms = some_transforms(rng)
     grid = pose_grid(table, transforms)
-    points, _ = jax.vmap(grid)(inside)
-    expected = skin_points(inside, jax.vmap(table)(inside), transforms)
+    points, _ = read(grid, inside)
+    expected = skin_points(inside, read(table, inside), transforms)
     np.testing.assert_allclose(points, expected, atol=2e-6)
 
 
 def test_the_jacobian_of_a_posed_grid_is_that_of_its_map(table, inside, rng):
     transforms = some_transforms(rng)
     grid = pose_grid(table, transforms)
-    _, fraction, _ = table.grids.locate(inside)
+    _, fraction, _ = locate(table.grids, inside)
     points = inside[jnp.all((fraction > 0.05) & (fraction < 0.95), -1)][:200]
-    _, found = jax.vmap(grid)(points)
-    automatic = jax.vmap(jax.jacfwd(lambda x: grid(x)[0]))(points)
+    _, found = read(grid, points)
+    automatic = jax.jit(jax.vmap(jax.jacfwd(lambda x: grid(x)[0])))(points)
     np.testing.assert_allclose(found, automatic, atol=5e-4)
-    by_field = jax.vmap(lambda x: skin_with_jacobian(table, x, transforms)[1])(points)
+    by_field = jax.jit(jax.vmap(lambda x: skin_with_jacobian(table, x, transforms)[1]))(points)
     np.testing.assert_allclose(found, by_field, atol=5e-4)
 
 
 def test_skinning_jacobian_agrees_with_differences(x64, rng):
     field, transforms = ArmField(jnp.asarray(12.0)), arm_transforms(1.1, (0.1, -0.2, 0.3))
+    map_ = jax.jit(lambda v: skin_points(v, field(v), transforms))
+    run = jax.jit(lambda v: skin_with_jacobian(field, v, transforms))
     for x in 0.1 * rng.normal(size=(5, 3)):
-        posed, jacobian, weights = skin_with_jacobian(field, jnp.asarray(x), transforms)
-        map_ = lambda v: skin_points(jnp.asarray(v), field(jnp.asarray(v)), transforms)  # noqa: E731
+        posed, jacobian, weights = run(x)
         np.testing.assert_allclose(posed, map_(x), atol=1e-14)
-        np.testing.assert_allclose(weights, field(jnp.asarray(x)))
+        np.testing.assert_allclose(weights, field(jnp.asarray(x)), rtol=1e-12)
         np.testing.assert_allclose(jacobian, central_difference(map_, x), atol=1e-8)
 
 
 def test_cover_of_a_table_is_that_of_its_grids(table, inside):
-    assert bool(jax.vmap(table.covers)(inside).all())
+    assert bool(covers(table, inside).all())
     assert not bool(table.covers(jnp.array([3.0, 0, 0])))
 
 

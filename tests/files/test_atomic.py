@@ -38,7 +38,7 @@ def test_an_error_leaves_the_former_file_and_nothing_else(tmp_path, error, forme
     target = tmp_path / "a.npz"
     if former is not None:
         target.write_bytes(former)
-    with pytest.raises(error), atomic_path(target) as temporary:
+    with pytest.raises(error), atomic_path(target) as temporary:  # noqa: PT012
         temporary.write_bytes(b"half")
         raise error("stop")
     assert entries(tmp_path) == ([] if former is None else ["a.npz"])
@@ -101,7 +101,7 @@ def test_a_folder_appears_whole(tmp_path):
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_interrupted_folder_leaves_nothing(tmp_path, error):
-    with pytest.raises(error), atomic_folder(tmp_path / "capture") as temporary:
+    with pytest.raises(error), atomic_folder(tmp_path / "capture") as temporary:  # noqa: PT012
         (temporary / "one").write_text("1")
         raise error
     assert entries(tmp_path) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
@@ -17,7 +16,8 @@ def binary_cross_entropy(
     **Raises:** `ValueError` if the shapes differ.
     """
     _same_shape(logit, target)
-    return jnp.maximum(logit, 0) - logit * target + jnp.log1p(jnp.exp(-jnp.abs(logit)))
+    # Not max(z, 0) + log1p(exp(-|z|)): its derivative at zero is not that of the loss.
+    return jax.nn.softplus(logit) - logit * target
 
 
 def squared_error(value: Float[Array, "*n"], target: Float[Array, "*n"]) -> Float[Array, "*n"]:

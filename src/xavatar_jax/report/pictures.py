@@ -69,7 +69,7 @@ def preview(
 
 
 def animation(
-    avatar: Avatar, frames: Frames, *, size: int = 360, count: int = 48
+    avatar: Avatar, frames: Frames, *, size: int = 360, count: int = 36
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """The avatar beside the truth, `count` frames of one sequence from a fixed camera."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))

@@ -23,8 +23,6 @@ from .prefit import initial_fields
 from .progress import progress
 from .step import make_steps, with_learned
 
-_REPORT_EVERY = 25
-
 
 class TrainingError(RuntimeError):
     """Training cannot go on: a term of the loss is not finite."""
@@ -120,10 +118,12 @@ def train_pool(
     callback: Callable[[int, AvatarFields, dict[str, float]], None] | None = None,
     history: History | None = None,
     initial: AvatarFields | None = None,
+    report_every: int = 25,
 ) -> Fitted:
     """Train fields on points that are labelled already, for `config.steps` or `seconds`.
 
-    The seconds count from the first step after compilation. `start` is what training begins
+    The seconds count from the first step after compilation. Every `report_every` steps the terms
+    are checked and recorded, and `callback` is called. `start` is what training begins
     from; `initial`, if it differs, what the result calls its step 0.
     """
     history = History() if history is None else history
@@ -150,7 +150,7 @@ def train_pool(
             if "skinning" in steps and k % config.polish_every == 0:
                 skinning = with_learned(start, state).skinning
                 pool = polish_roots(skinning, tabulate_for_search(body, skinning, config), pool)
-            if k % _REPORT_EVERY and k != config.steps:
+            if k % report_every and k != config.steps:
                 continue
             values = {name: float(value) for name, value in latest.items()}
             _check_finite(values, k)

@@ -27,7 +27,7 @@ from .model import AvatarFields, fresh_fields, trainable_filter
 from .progress import progress
 
 _POINTS = 400_000
-_BATCH = 8192
+_BATCH, _NETWORK_BATCH = 8192, 2048  # a network costs a hundred times more a point
 
 
 def initial_fields(
@@ -72,6 +72,8 @@ def _fit_mean_shape(
     points, distance, weights = _mean_shape_points(body, config)
     params = BodyParams.zeros(body)
     learned, fixed = eqx.partition(fields, _prefit_filter(fields, config))
+    network = "mlp" in (config.skinning.kind, config.geometry.kind)
+    batch = _NETWORK_BATCH if network else _BATCH
     rate = optax.cosine_decay_schedule(
         config.optimiser.learning_rate, max(config.prefit_steps, 1), alpha=0.05
     )
@@ -85,7 +87,7 @@ def _fit_mean_shape(
     def step(learned: Any, state: Any, k: Array, data: Any, fixed_arrays: Any) -> Any:
         points, distance, weights = data
         key = jax.random.fold_in(jax.random.key(config.seed), k)
-        rows = jax.random.randint(key, (_BATCH,), 0, len(points))
+        rows = jax.random.randint(key, (batch,), 0, len(points))
 
         def loss(learned: AvatarFields) -> Array:
             fields = eqx.combine(learned, fixed_arrays, static)

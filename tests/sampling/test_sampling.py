@@ -1,0 +1,231 @@
+"""Signed distances against a sphere's, plans and seeds, and points on the skeleton."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from helpers import PARENTS, TREES
+
+from xavatar_jax.body import BodyParams
+from xavatar_jax.frames import Frame
+from xavatar_jax.sampling import (
+    SamplingPlan,
+    bone_points,
+    joint_targets,
+    sample_frame,
+    signed_distance,
+    varied_frames,
+)
+
+
+def sphere(radius, centre=(0.0, 0.0, 0.0), subdivisions=4):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return np.asarray(mesh.vertices) + centre, np.asarray(mesh.faces)
+
+
+def joined(*pieces):
+    vertices, faces, count = [], [], 0
+    for v, f in pieces:
+        vertices.append(v)
+        faces.append(f + count)
+        count += len(v)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def points_at(radii, rng):
+    direction = rng.normal(size=(len(radii), 3))
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.asarray(radii)[:, None]
+
+
+SAG = 3e-4  # metres: how far a triangle of the finest sphere of radius 0.1 lies below it
+
+
+def test_distance_to_a_sphere(rng):
+    radii = rng.uniform(0, 0.3, 500)
+    radii[:3] = [0.0, 0.0999, 0.11]
+    found = signed_distance(*sphere(0.1), points_at(radii, rng))
+    np.testing.assert_allclose(found, 0.1 - radii, atol=SAG)
+
+
+def test_a_sphere_inside_the_solid_is_no_surface(rng):
+    """An eyeball inside the head: its surface is neither a boundary nor near one."""
+    vertices, faces = joined(sphere(0.1), sphere(0.05))
+    radii = np.concatenate([rng.uniform(0, 0.09, 300), rng.uniform(0.092, 0.12, 100)])
+    found = signed_distance(vertices, faces, points_at(radii, rng), near=0.02)
+    expected = 0.1 - radii
+    assert (found[radii < 0.09] > 0).all()
+    near_inner = np.abs(radii - 0.05) < 0.018
+    np.testing.assert_allclose(found[near_inner], 0.02)  # "inside, and not near the surface"
+    outer = radii > 0.085
+    np.testing.assert_allclose(found[outer], expected[outer], atol=SAG)
+
+
+def test_a_cavity_is_a_surface(rng):
+    """The inner sphere turned inside out is a hole in the solid."""
+    inner = sphere(0.05)
+    vertices, faces = joined(sphere(0.1), (inner[0], inner[1][:, ::-1]))
+    radii = rng.uniform(0, 0.12, 300)
+    found = signed_distance(vertices, faces, points_at(radii, rng))
+    expected = np.minimum(0.1 - radii, radii - 0.05)
+    np.testing.assert_allclose(found, expected, atol=SAG)
+
+
+def test_overlapping_pieces_are_one_solid(rng):
+    """Where two spheres overlap, the buried parts of both are no surface."""
+    vertices, faces = joined(sphere(0.1), sphere(0.1, (0.12, 0, 0)))
+    points = rng.uniform([-0.15, -0.15, -0.15], [0.27, 0.15, 0.15], (2000, 3))
+    union = np.maximum(
+        0.1 - np.linalg.norm(points, axis=1), 0.1 - np.linalg.norm(points - [0.12, 0, 0], axis=1)
+    )
+    found = signed_distance(vertices, faces, points)
+    outside = union < -SAG
+    np.testing.assert_allclose(found[outside], union[outside], atol=SAG)
+    np.testing.assert_array_equal(found[np.abs(union) > SAG] > 0, union[np.abs(union) > SAG] > 0)
+
+
+def test_an_open_mesh_has_an_inside(rng):
+    """A hole at the top: away from it, signs are those of the closed sphere."""
+    vertices, faces = sphere(0.1)
+    faces = faces[vertices[faces].mean(1)[:, 2] < 0.095]
+    assert len(faces) < len(sphere(0.1)[1])
+    radii = rng.uniform(0, 0.2, 500)
+    points = points_at(radii, rng)
+    clear = (points[:, 2] < 0.06) & (np.abs(radii - 0.1) > 2 * SAG)
+    found = signed_distance(vertices, faces, points)
+    np.testing.assert_array_equal(found[clear] > 0, radii[clear] < 0.1)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Four spheres: a body, a face and two hands; labels by vertex."""
+    pieces = [
+        sphere(0.3, subdivisions=3),
+        sphere(0.1, (0, 0.5, 0), 3),
+        sphere(0.05, (0.6, 0, 0), 2),
+        sphere(0.05, (-0.6, 0, 0), 2),
+    ]
+    vertices, faces = joined(*pieces)
+    labels = np.repeat([0, 1, 2, 3], [len(v) for v, _ in pieces])
+    face = labels == 1
+    labels[face & (vertices[:, 2] > 0.05)] = 4
+    params = BodyParams(jnp.zeros((1, 3)), jnp.zeros(1), jnp.zeros(0), jnp.zeros(3), TREES["mano"])
+    return Frame(vertices.astype(np.float32), faces.astype(np.int32), params, None, "toy"), labels
+
+
+PLAN = SamplingPlan(
+    body=200, face=80, eyes_mouth=40, hand=60, box=50, sigma=(0.0,), fine_sigma=(0.0,)
+)
+
+
+@pytest.mark.parametrize("by_vertex", [True, False])
+def test_counts_by_part_and_places(frame, by_vertex):
+    plan = replace(PLAN, by_vertex=by_vertex)
+    assert plan.total == 200 + 80 + 40 + 2 * 60 + 50
+    found = sample_frame(*frame, plan, np.random.default_rng(0))
+    assert found.points.shape == (plan.total, 3)
+    assert found.points.dtype == np.float32
+    counts = np.bincount(found.parts, minlength=5)
+    np.testing.assert_array_equal(counts, [250, 80, 60, 60, 40])
+    for part, centre, radius in ((2, (0.6, 0, 0), 0.05), (3, (-0.6, 0, 0), 0.05)):
+        away = np.linalg.norm(found.points[found.parts == part] - centre, axis=1)
+        np.testing.assert_allclose(away, radius, atol=3e-3)
+        assert np.abs(found.distance[found.parts == part]).max() < 1e-5
+    low, high = frame[0].vertices.min(0) - 0.1, frame[0].vertices.max(0) + 0.1
+    box = found.points[-50:]
+    assert ((box >= low) & (box <= high)).all()
+    assert np.ptp(box, axis=0).min() > 0.5 * (high - low).min()
+
+
+def test_noise_has_the_sizes_given(frame):
+    plan = SamplingPlan(
+        body=4000, face=0, eyes_mouth=0, hand=0, sigma=(0.002, 0.03), by_vertex=False
+    )
+    found = sample_frame(*frame, plan, np.random.default_rng(1))
+    off = np.abs(np.linalg.norm(found.points, axis=1) - 0.3)
+    # Along the normal of a sphere the offset is a normal deviate: mean size 0.8 sigma.
+    np.testing.assert_allclose(off[::2].mean(), 0.8 * 0.002, atol=1e-3)
+    np.testing.assert_allclose(off[1::2].mean(), 0.8 * 0.03, rtol=0.1)
+    expected = 0.3 - np.linalg.norm(found.points, axis=1)
+    alone = np.abs(found.points).max(1) < 0.32  # nearer to this sphere than to the others
+    np.testing.assert_allclose(found.distance[alone], expected[alone], atol=4e-3)
+
+
+def test_the_whole_surface_without_parts(frame):
+    plan = replace(PLAN, uniform=True, by_vertex=False, box=0)
+    found = sample_frame(*frame, plan, np.random.default_rng(2))
+    assert len(found.points) == plan.total
+    areas = np.array([0.3, 0.1, 0.05, 0.05]) ** 2
+    share = np.bincount(np.where(found.parts == 4, 1, found.parts), minlength=4) / plan.total
+    np.testing.assert_allclose(share, areas / areas.sum(), atol=0.05)
+
+
+def test_a_missing_part_gives_its_points_to_the_body(frame):
+    toy, labels = frame
+    found = sample_frame(toy, np.where(labels == 2, 0, labels), PLAN, np.random.default_rng(0))
+    counts = np.bincount(found.parts, minlength=5)
+    np.testing.assert_array_equal(counts, [310, 80, 0, 60, 40])
+
+
+def test_seeds(frame):
+    plan = replace(PLAN, sigma=(0.01,))
+    a, b, c = (sample_frame(*frame, plan, np.random.default_rng(s)) for s in (5, 5, 6))
+    for x, y in zip(a, b, strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert not np.array_equal(a.points, c.points)
+
+
+def test_varied_frames_pick_the_odd_ones_out(rng):
+    """Ninety frames alike and three unlike: those three are chosen, whatever their place."""
+    pose = 1e-3 * rng.normal(size=(93, 55, 3))
+    odd = [17, 50, 92]
+    pose[17, 16], pose[50, 5], pose[92, 30] = (0, 1, 0), (1.2, 0, 0), (0, 0, 1.5)
+    params = BodyParams(
+        jnp.asarray(pose), jnp.zeros((93, 1)), jnp.zeros((93, 2)), jnp.zeros((93, 3)),
+        TREES["smplx"],
+    )  # fmt: skip
+    chosen = varied_frames(params, 4)
+    assert set(odd) <= set(chosen)
+    assert list(chosen) == sorted(chosen)
+    np.testing.assert_array_equal(chosen, varied_frames(params, 4))
+    np.testing.assert_array_equal(varied_frames(params, 200), np.arange(93))
+    # Where a person stands and faces tells nothing about their shape.
+    turned = replace(params, pose=params.pose.at[40, 0].set(jnp.array([0.0, 3.0, 0.0])))
+    np.testing.assert_array_equal(varied_frames(turned, 4), chosen)
+    smiling = replace(params, expression=params.expression.at[40].set(5.0))
+    assert 40 in varied_frames(smiling, 4)
+
+
+@pytest.mark.parametrize("kind", PARENTS)
+def test_bone_points_lie_on_their_bones(kind, rng):
+    tree = TREES[kind]
+    joints = rng.normal(size=(tree.num_joints, 3))
+    points = bone_points(tree, jnp.asarray(joints, jnp.float32), jax.random.key(0))
+    points = np.asarray(points).reshape(tree.num_joints - 1, 5, 3)
+    for row, (joint, parent) in enumerate(zip(range(1, tree.num_joints), PARENTS[kind][1:],
+                                              strict=True)):  # fmt: skip
+        along = joints[joint] - joints[parent]
+        share = (points[row] - joints[parent]) @ along / (along @ along)
+        assert ((share > -1e-5) & (share < 1 + 1e-5)).all()
+        away = points[row] - joints[parent] - share[:, None] * along
+        np.testing.assert_allclose(away, 0, atol=1e-5)
+        assert np.ptp(share) > 0.3  # spread from end to end
+    again = bone_points(tree, jnp.asarray(joints, jnp.float32), jax.random.key(1))
+    assert not np.array_equal(np.asarray(again).reshape(points.shape), points)
+
+
+def test_joint_targets_are_the_two_bones_that_meet():
+    where, target = joint_targets(TREES["smplx"])
+    assert where.shape == (109,)
+    assert target.shape == (109, 55)
+    np.testing.assert_array_equal(target.sum(1), 1)
+    # The mean target at a joint: half its own bone, half its parent's.
+    for joint in range(1, 55):
+        mean = target[where == joint].mean(0)
+        assert mean[joint] == 0.5
+        assert mean[PARENTS["smplx"][joint]] == 0.5
+    np.testing.assert_array_equal(target[where == 0], np.eye(55)[:1])
