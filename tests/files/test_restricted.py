@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 
 from xavatar_jax.files import UnsafePickleError, load_npz, load_pickle
 
+FUZZ = settings(deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+
 
 def write(path, value, protocol=2):
     path.write_bytes(pickle.dumps(value, protocol))
@@ -147,7 +149,7 @@ def attacks(marker):
     return {
         "os.system": Attack(os.system, command),
         "eval": Attack(eval, f"open({str(marker)!r}, 'w').close()"),
-        "getattr": Attack(getattr, os, "getcwd"),
+        "getattr": Attack(getattr, "text", "upper"),
         "open": Attack(open, str(marker), "w"),
         "numpy": Attack(np.save, str(marker), 1),
         "partial": Attack(__import__("functools").partial, os.system, command),
@@ -158,19 +160,13 @@ def attacks(marker):
 @pytest.mark.parametrize("container", ["pkl", "npz"])
 def test_code_is_refused_and_not_run(tmp_path, name, container):
     marker = tmp_path / "ran"
-    payload = {"v_template": attacks(marker)[name]} if name != "getattr" else attacks(marker)[name]
+    payload = {"v_template": attacks(marker)[name]}
     path = tmp_path / f"evil.{container}"
     if container == "pkl":
-        try:
-            path.write_bytes(pickle.dumps(payload, 2))
-        except (pickle.PicklingError, TypeError):
-            pytest.skip("cannot be pickled in this way")
+        path.write_bytes(pickle.dumps(payload, 2))
         load = load_pickle
     else:
-        try:
-            np.savez(path, good=np.zeros(2), evil=np.array(payload, dtype=object))
-        except (pickle.PicklingError, TypeError):
-            pytest.skip("cannot be pickled in this way")
+        np.savez(path, good=np.zeros(2), evil=np.array(payload, dtype=object))
         load = load_npz
     with pytest.raises(UnsafePickleError, match=rf"evil\.{container}") as error:
         load(path)
@@ -248,27 +244,38 @@ def test_other_files_are_refused_by_name(tmp_path, load, content):
         load(path)
 
 
-WHOLE = pickle.dumps({"a": np.arange(4.0), "b": [1, "x", {"c": (2, None)}], "d": 1.5}, 2)
+ARRAYS = pickle.dumps({"a": np.arange(4.0), "b": scipy.sparse.csc_matrix(np.eye(3))}, 2)
+# Bytes are changed in this one alone: NumPy itself trusts the flags of a pickled dtype.
+PLAIN = pickle.dumps({"a": {3, 4}, "b": [1, "x", {"c": (2, None)}], "d": 1.5, "e": 1j}, 2)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-@given(st.integers(0, len(WHOLE) - 1), st.integers(0, 255), st.booleans())
-def test_a_damaged_pickle_is_an_error_of_ours_or_data(tmp_path_factory, place, byte, cut):
+@pytest.mark.parametrize("whole", [ARRAYS, PLAIN], ids=["arrays", "plain"])
+def test_a_truncated_pickle_is_an_error_of_ours(tmp_path, whole):
+    path = tmp_path / "cut.pkl"
+    for length in range(0, len(whole), 3):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"cut\.pkl"):
+            load_pickle(path)
+
+
+@settings(FUZZ, max_examples=150)
+@given(st.integers(0, len(PLAIN) - 1), st.integers(0, 255))
+def test_a_damaged_pickle_is_an_error_of_ours_or_data(tmp_path_factory, place, byte):
     path = tmp_path_factory.mktemp("fuzz") / "damaged.pkl"
-    damaged = bytearray(WHOLE)
+    damaged = bytearray(PLAIN)
     damaged[place] = byte
-    path.write_bytes(bytes(damaged[:place] if cut else damaged))
+    path.write_bytes(bytes(damaged))
     try:
         load_pickle(path)
     except ValueError as error:  # UnsafePickleError is one
         assert "damaged.pkl" in str(error)  # noqa: PT017 (an error is one of two good ends)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(FUZZ, max_examples=60)
 @given(st.integers(0, 10_000), st.integers(1, 255))
 def test_a_damaged_object_array_is_an_error_of_ours_or_data(tmp_path_factory, place, flip):
     payload = io.BytesIO()
-    np.save(payload, np.array({"pelvis": 0, "x": np.arange(3)}, dtype=object))
+    np.save(payload, np.array({"pelvis": 0, "x": [1, 2.5]}, dtype=object))
     damaged = bytearray(payload.getvalue())
     damaged[place % len(damaged)] ^= flip
     path = tmp_path_factory.mktemp("fuzz") / "damaged.npz"

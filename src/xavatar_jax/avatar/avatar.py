@@ -165,7 +165,7 @@ class Avatar:
 
     @cached_property
     def _table(self) -> TabulatedSkinning:
-        return tabulate_for_search(self.body, self.fields.skinning, self.config)
+        return tabulate_for_search(self.body, self.betas, self.fields.skinning, self.config)
 
     @cached_property
     def _base_mesh(self) -> Mesh:

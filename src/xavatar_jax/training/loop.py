@@ -89,10 +89,10 @@ def fit_fields(
     clock = history.lap("labels", clock)
     if config.search.cached:
         with progress("roots", len(chosen), verbose=verbose, unit="frame") as bar:
-            pool = find_roots(body, start.skinning, pool, config, bar=bar)
+            pool = find_roots(body, betas, start.skinning, pool, config, bar=bar)
         history.found = float(pool.found.mean() / pool.points.shape[1])
         clock = history.lap("roots", clock)
-    return train_pool(
+    fitted = train_pool(
         body,
         start,
         pool,
@@ -104,6 +104,8 @@ def fit_fields(
         history=history,
         initial=initial,
     )
+    history.lap("total", started)
+    return fitted
 
 
 def train_pool(
@@ -135,6 +137,8 @@ def train_pool(
     latest: dict[str, Any] = {}
     for name in names:
         state, terms = jax.block_until_ready(steps[name](state, pool))
+        # The first steps show bad data while the fields are still good: the term named is to blame.
+        _check_finite({term: float(value) for term, value in terms.items()}, 1)
         latest.update(terms)
     clock = history.lap("compile", clock)
     per_step = config.frames_per_step * config.points_per_step
@@ -149,7 +153,9 @@ def train_pool(
             bar.update(1)
             if "skinning" in steps and k % config.polish_every == 0:
                 skinning = with_learned(start, state).skinning
-                pool = polish_roots(skinning, tabulate_for_search(body, skinning, config), pool)
+                pool = polish_roots(
+                    skinning, tabulate_for_search(body, betas, skinning, config), pool
+                )
             if k % report_every and k != config.steps:
                 continue
             values = {name: float(value) for name, value in latest.items()}
@@ -180,7 +186,9 @@ def subject_betas(frames: Frames) -> np.ndarray:
 
 
 def _check_finite(values: dict[str, float], step: int) -> None:
-    for name, value in values.items():
+    # The sum comes last: it is not finite because one of its terms is not.
+    for name in sorted(values, key=lambda n: n.endswith("loss")):
+        value = values[name]
         if not np.isfinite(value):
             raise TrainingError(
                 f"the {name} term is {value} at step {step}: training has stopped. Lower the "

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..body import BodyModel, BodyParams, bone_transforms
+from ..body import BodyModel, BodyParams, bone_transforms, canonical_vertices
 from ..correspondence import ClosedFormNewton, search_grid, start_table
 from ..fields import (
     AbstractSkinningField,
     GridSkinning,
     TabulatedSkinning,
     body_part_grids,
-    mean_canonical_vertices,
     pose_grid,
     tabulate,
 )
@@ -94,18 +95,20 @@ def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: obj
 
 
 def tabulate_for_search(
-    body: BodyModel, skinning: AbstractSkinningField, config: FitConfig
+    body: BodyModel, betas: Any, skinning: AbstractSkinningField, config: FitConfig
 ) -> TabulatedSkinning:
-    """The field on the search's grids; a grid field is tabulated on its own."""
+    """The field on grids around the person's canonical body; a grid field on its own grids."""
     if isinstance(skinning, GridSkinning):
         grids = skinning.grids
     else:
-        grids = body_part_grids(body, mean_canonical_vertices(body), config.search.grid)
+        vertices = np.asarray(canonical_vertices(body, jnp.asarray(betas)), np.float64)
+        grids = body_part_grids(body, vertices, config.search.grid)
     return eqx.filter_jit(tabulate)(skinning, grids)
 
 
 def find_roots(
     body: BodyModel,
+    betas: Any,
     skinning: AbstractSkinningField,
     pool: FramePool,
     config: FitConfig,
@@ -113,7 +116,7 @@ def find_roots(
     bar: object,
 ) -> FramePool:
     """Search every point of the pool on the tabulated field, frame by frame."""
-    table = tabulate_for_search(body, skinning, config)
+    table = tabulate_for_search(body, betas, skinning, config)
     bones, mask = (jnp.asarray(v) for v in start_table(body.tree, config.search.starts))
     solver = ClosedFormNewton(atol=config.search.atol, divergence=1.0)
 
