@@ -45,15 +45,15 @@ def benchmark_config(quick: bool, seed: int) -> FitConfig:
     return replace(
         config,
         seed=seed,
-        steps=25 if quick else 150,
+        steps=40 if quick else 200,
         train_frames=6 if quick else 30,
         frames_per_step=2,
         points_per_step=400 if quick else 1000,
         prefit_steps=1000 if quick else 4000,
         geometry=replace(xa.quick().geometry),
         search=replace(config.search, keep=3),
-        losses=replace(config.losses, softness=0.004),
-        optimiser=replace(config.optimiser, learning_rate=2e-3, clip=1.0),
+        losses=replace(config.losses, softness=0.004, surface_points=512),
+        optimiser=replace(config.optimiser, learning_rate=3e-3, skinning_rate=1e-4, clip=1.0),
     )
 
 

@@ -2,12 +2,14 @@
 
 Under `vmap` a loop runs every lane until the last one ends, and some starts never converge: all
 lanes pay for the slowest. Here a fixed number of unfinished lanes is gathered, stepped and
-scattered back, until none is left. Shapes are fixed, so it works under `jit`.
+scattered back, until none is left; as lanes run out, fewer are gathered at a time. Shapes are
+fixed, so it works under `jit`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -55,12 +57,12 @@ def solve_lanes(
     states = jax.tree.map(lambda s: jnp.zeros((lanes + 1, *s.shape), s.dtype), struct)
     fresh = jnp.concatenate([active, jnp.zeros(1, bool)])
 
-    def gather(mask: Array) -> Array:
-        return jnp.nonzero(mask, size=width, fill_value=lanes)[0]
+    def gather(mask: Array, size: int) -> Array:
+        return jnp.nonzero(mask, size=size, fill_value=lanes)[0]
 
     def begin(carry: tuple) -> tuple:
         y, states, todo, fresh, steps = carry
-        rows = gather(fresh)
+        rows = gather(fresh, width)
         own = jax.tree.map(lambda leaf: leaf[rows], args)
         state = jax.vmap(init)(y[rows], own)
         going = ~jax.vmap(ended)(y[rows], own, state)
@@ -68,9 +70,9 @@ def solve_lanes(
         todo = todo.at[rows].set(going).at[lanes].set(False)
         return y, states, todo, fresh.at[rows].set(False), steps
 
-    def advance(carry: tuple) -> tuple:
+    def advance(size: int, carry: tuple) -> tuple:
         y, states, todo, fresh, steps = carry
-        rows = gather(todo)
+        rows = gather(todo, size)
         own = jax.tree.map(lambda leaf: leaf[rows], args)
         state = jax.tree.map(lambda leaf: leaf[rows], states)
         moved, state = jax.vmap(step)(y[rows], own, state)
@@ -82,7 +84,12 @@ def solve_lanes(
 
     carry = (start, states, jnp.zeros(lanes + 1, bool), fresh, jnp.zeros(lanes + 1, jnp.int32))
     carry = jax.lax.while_loop(lambda c: jnp.any(c[3]), begin, carry)
-    y, states, _, _, steps = jax.lax.while_loop(lambda c: jnp.any(c[2]), advance, carry)
+    # The last lanes are those that never converge: a wide gather would be mostly padding.
+    sizes = [width, *(size for size in (width // 8, width // 64) if size >= 8)]
+    for size, smaller in zip(sizes, [*sizes[1:], 0], strict=True):
+        enough = partial(lambda least, c: jnp.sum(c[2]) > least, smaller)
+        carry = jax.lax.while_loop(enough, partial(advance, size), carry)
+    y, states, _, _, steps = carry
     residual = jnp.sqrt(jnp.sum(states.residual**2, axis=-1))
     residual = jnp.where(active, residual[:lanes], jnp.inf)
     return y[:lanes], residual, steps[:lanes]

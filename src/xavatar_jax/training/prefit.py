@@ -20,7 +20,7 @@ from ..body import FACES, HANDS, BodyModel, BodyParams
 from ..fields import mean_canonical_vertices, template_weights
 from ..files import cache_dir, flatten_named, load_arrays, save_arrays, unflatten_named
 from ..geometry import face_areas
-from ..losses import binary_cross_entropy, soft_occupancy, squared_error
+from ..losses import binary_cross_entropy, soft_occupancy
 from ..sampling import signed_distance
 from .config import FitConfig
 from .model import AvatarFields, fresh_fields, trainable_filter
@@ -97,7 +97,8 @@ def _fit_mean_shape(
             total = binary_cross_entropy(logit, target).mean()
             if weights is not None:
                 found = jax.vmap(fields.skinning)(points[rows])
-                total = total + 100 * squared_error(found, weights[rows]).mean()
+                # Cross-entropy: unlike a squared error it still pulls where a weight is near zero.
+                total = total - (weights[rows] * jnp.log(found + 1e-6)).sum(-1).mean()
             return total
 
         value, gradient = jax.value_and_grad(loss)(learned)

@@ -139,6 +139,7 @@ def _make_step(
     several: int,
 ) -> Step:
     fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
+    share = config.optimiser.skinning_rate / config.optimiser.learning_rate
 
     # Frozen arrays are arguments, not constants: baked in, they would be folded at compile time.
     @eqx.filter_jit(donate="all-except-first")
@@ -158,6 +159,13 @@ def _make_step(
         own = _own(state.learned, name)
         (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
         updates, optimiser_state = optimiser.update(gradient, state.optimisers[name], own)
+        if name == "both":
+            # One clip over all, as the paper has it, but a rate for each field.
+            updates = eqx.tree_at(
+                lambda u: u.skinning,
+                updates,
+                jax.tree.map(lambda leaf: share * leaf, updates.skinning),
+            )
         learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
         optimisers = {**state.optimisers, name: optimiser_state}
         label = "loss" if name != "skinning" else "skinning_loss"
