@@ -10,6 +10,13 @@ from helpers import COLUMNS, PARENTS, toy_arrays
 from xavatar_jax.body import load_body, synthetic_body
 
 
+@pytest.fixture(scope="session", autouse=True)
+def compile_once(tmp_path_factory):
+    """What was compiled once in a run is not compiled again: many tests share programs."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
 @pytest.fixture
 def rng():
     """A generator that starts alike in every test."""

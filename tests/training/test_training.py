@@ -108,19 +108,41 @@ def test_batches_take_only_points_with_roots(case):
     assert batch.others.shape[:2] == (2, 8)
 
 
-def test_same_seed_same_numbers(case):
+@pytest.fixture(scope="module")
+def trained(case):
+    """One run, and how often each objective was traced in it."""
     body, _, config, fields, pool = case
-    betas = np.zeros(10)
-    first, second = (
-        train_pool(body, fields, pool, betas, config, verbose=False).fields for _ in range(2)
-    )
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+    traces = {"geometry": 0, "skinning": 0}
+
+    def counted(name, objective):
+        def wrapped(*args):
+            traces[name] += 1
+            return objective(*args)
+
+        return wrapped
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in traces:
+            attribute = f"{name}_objective"
+            patch.setattr(step_module, attribute, counted(name, getattr(step_module, attribute)))
+        done = train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
+    return done, traces
+
+
+def test_steps_are_traced_once(trained):
+    assert trained[1] == {"geometry": 1, "skinning": 1}
+
+
+def test_same_seed_same_numbers(case, trained):
+    body, _, config, fields, pool = case
+    again = train_pool(body, fields, pool, np.zeros(10), config, verbose=False).fields
+    for a, b in zip(jax.tree.leaves(trained[0].fields), jax.tree.leaves(again), strict=True):
         assert np.array_equal(a, b)
 
 
-def test_only_learned_leaves_change(case):
-    body, _, config, fields, pool = case
-    after = train_pool(body, fields, pool, np.zeros(10), config, verbose=False).fields
+def test_only_learned_leaves_change(case, trained):
+    _, _, config, fields, _ = case
+    after = trained[0].fields
     learned = trainable_filter(fields, config)
     fixed_before = jax.tree.leaves(eqx.filter(fields, learned, inverse=True))
     fixed_after = jax.tree.leaves(eqx.filter(after, learned, inverse=True))
@@ -136,24 +158,6 @@ def test_fixed_template_weights_stay(case):
     after = train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
     assert np.array_equal(fields.skinning.correction, after.fields.skinning.correction)
     assert not any(name.startswith("skinning") for name in after.history.terms)
-
-
-def test_steps_are_traced_once(case, monkeypatch):
-    body, _, config, fields, pool = case
-    traces = {"geometry": 0, "skinning": 0}
-
-    def counted(name, objective):
-        def wrapped(*args):
-            traces[name] += 1
-            return objective(*args)
-
-        return wrapped
-
-    for name in traces:
-        attribute = f"{name}_objective"
-        monkeypatch.setattr(step_module, attribute, counted(name, getattr(step_module, attribute)))
-    train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
-    assert traces == {"geometry": 1, "skinning": 1}
 
 
 def test_a_loss_that_is_not_finite_names_its_term(case):
