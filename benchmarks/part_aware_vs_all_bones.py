@@ -25,7 +25,7 @@ import numpy as np
 import xavatar_jax as xa
 from xavatar_jax.avatar import Avatar
 from xavatar_jax.body import BODY, FACES, HANDS, canonical_vertices
-from xavatar_jax.correspondence import search_field, start_table
+from xavatar_jax.correspondence import StartSet, search_field, start_table
 from xavatar_jax.kinematics import skin_points
 from xavatar_jax.report import describe_machine, write_json
 from xavatar_jax.sampling import varied_frames
@@ -35,7 +35,7 @@ from xavatar_jax.training.pool import FramePool, label_frames
 from xavatar_jax.training.prefit import initial_fields
 from xavatar_jax.training.progress import progress
 
-STARTS = ("part_aware", "full", "body")
+STARTS: tuple[StartSet, ...] = ("part_aware", "full", "body")
 NAMES = {"part_aware": "part-aware", "full": "all bones (A2)", "body": "body bones (A1)"}
 
 
@@ -82,9 +82,9 @@ def known_points(
     return cases
 
 
-def measure_search(avatar: Avatar, cases: list, starts: str) -> dict[str, Any]:
+def measure_search(avatar: Avatar, cases: list, starts: StartSet) -> dict[str, Any]:
     """Points a second and recall of the generating correspondence, on the network itself."""
-    bones, mask = (jnp.asarray(v) for v in start_table(avatar.body.tree, starts))  # type: ignore
+    bones, mask = (jnp.asarray(v) for v in start_table(avatar.body.tree, starts))
     field = avatar.fields.skinning
     first = cases[0]
     clock = time.perf_counter()
@@ -118,10 +118,10 @@ def train(
     capture: Any,
     betas: np.ndarray,
     config: FitConfig,
-    starts: str,
+    starts: StartSet,
 ) -> tuple[dict[str, Any], list[tuple[float, int, AvatarFields]]]:
     """Steps a second, and the fields as they were along the way, with seconds and steps."""
-    config = replace(config, search=replace(config.search, starts=starts))  # type: ignore
+    config = replace(config, search=replace(config.search, starts=starts))
     way: list[tuple[float, int, AvatarFields]] = []
     clock = [time.perf_counter()]
 

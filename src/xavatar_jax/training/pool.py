@@ -62,7 +62,7 @@ def frame_labels(body: BodyModel, frame: Frame) -> Int[np.ndarray, " V"]:
     return nearest_part_labels(body, frame.params, frame.vertices)
 
 
-def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: object) -> FramePool:
+def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any) -> FramePool:
     """Draw and label the points of every frame. Roots come later.
 
     Draws are keyed by seed and frame: the same frame gets the same points in any order.
@@ -76,7 +76,7 @@ def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: obj
         points.append(samples.points - shift)
         parts.append(samples.parts.astype(np.int8))
         distance.append(samples.distance)
-        bar.update(1)  # type: ignore[attr-defined]
+        bar.update(1)
     params = centred(frames.params)
     transforms = eqx.filter_jit(jax.vmap(lambda p: bone_transforms(body, p)))(params)
     shape = (len(points), len(points[0]))
@@ -113,7 +113,7 @@ def find_roots(
     pool: FramePool,
     config: FitConfig,
     *,
-    bar: object,
+    bar: Any,
 ) -> FramePool:
     """Search every point of the pool on the tabulated field, frame by frame."""
     table = tabulate_for_search(body, betas, skinning, config)
@@ -139,7 +139,7 @@ def find_roots(
     for k in range(pool.points.shape[0]):
         x_c, valid = search(table, pool.points[k], pool.parts[k], pool.transforms[k])
         rows.append((np.asarray(x_c), np.asarray(valid)))
-        bar.update(1)  # type: ignore[attr-defined]
+        bar.update(1)
     return _ordered(pool, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
 
 
