@@ -20,7 +20,8 @@ from helpers import (
 
 from xavatar_jax.correspondence import (
     Broyden,
-    determinant,
+    Outcome,
+    StartTable,
     find_correspondences,
     implicit_root,
     pull_back,
@@ -187,13 +188,6 @@ def test_where_the_map_folds_there_is_no_derivative(x64):
     assert all(not np.asarray(leaf).any() for leaf in jax.tree.leaves(slopes))
 
 
-def test_determinant(x64, rng):
-    matrices = rng.normal(size=(4, 5, 3, 3))
-    np.testing.assert_allclose(
-        determinant(jnp.asarray(matrices)), np.linalg.det(matrices), atol=1e-12
-    )
-
-
 def test_failed_starts_have_no_gradient(x64):
     """A point that is not finite and one that no bone reaches, among one that is found."""
 
@@ -283,7 +277,16 @@ def test_no_retrace_on_the_second_call(rng):
 
 # The fast paths, against the plain search on the same field.
 
-BONES, MASK = np.array([[0, 1], [1, 0]], np.int32), np.array([[True, True], [True, False]])
+
+def starts(*rows):
+    """A table of the arm's bones, a row for each part."""
+    width = max(len(row) for row in rows)
+    index = np.array([[*row, *[0] * (width - len(row))] for row in rows], np.int32)
+    mask = np.array([[k < len(row) for k in range(width)] for row in rows])
+    return StartTable(jnp.asarray(index), jnp.asarray(mask), jnp.array([0, 0]))
+
+
+STARTS = starts((0, 1), (1,))
 
 
 def cloud(rng, bend, count=150):
@@ -319,13 +322,11 @@ def assert_same_roots(plain, fast, tolerance, least):
 def test_the_fast_search_finds_the_roots_of_the_plain_one(rng, bend):
     field, transforms = two_bone_arm(bend)
     points = cloud(rng, bend)
-    fast = search_field(
-        field, points, jnp.zeros(len(points), int), transforms, BONES, MASK, width=64
-    )
+    fast = search_field(field, points, jnp.zeros(len(points), int), transforms, STARTS, width=64)
     plain = find(points, field, transforms)
     assert_same_roots(plain, fast, 2e-4, least=0.97)
     assert int(fast.lanes) == 2 * len(points)
-    assert not np.asarray(fast.overflow).any()
+    assert not np.asarray(fast.more).any()
     valid = np.asarray(fast.valid)
     assert (np.asarray(fast.residual)[valid] < 1e-5).all()
     assert np.isinf(np.asarray(fast.residual)[~valid]).all()
@@ -350,7 +351,7 @@ def test_the_grid_search_finds_the_roots_of_the_plain_one(rng, arm_table, bend):
     points = cloud(rng, bend)[:150]
     fast = search_grid(
         pose_grid(arm_table, transforms), points, jnp.zeros(len(points), int), transforms,
-        BONES, MASK, width=64,
+        STARTS, width=64,
     )  # fmt: skip
     plain = find(points, arm_table, transforms)
     assert_same_roots(plain, fast, 2e-4, least=0.9)
@@ -362,24 +363,24 @@ def test_both_roots_of_the_folded_arm_come_out_once(arm_table):
     points = jnp.asarray(folded_points(), jnp.float32)
     parts = jnp.zeros(len(points), int)
     # Every bone twice: duplicates must go, and the two roots stay.
-    bones, mask = np.array([[0, 1, 0, 1, 1]], np.int32), np.ones((1, 5), bool)
+    table = starts((0, 1, 0, 1, 1))
     for found in (
-        search_field(field, points, parts, transforms, bones, mask),
-        search_grid(pose_grid(arm_table, transforms), points, parts, transforms, bones, mask),
+        search_field(field, points, parts, transforms, table),
+        search_grid(pose_grid(arm_table, transforms), points, parts, transforms, table),
     ):
         np.testing.assert_array_equal(np.asarray(found.valid).sum(1), 2)
         assert (np.asarray(found.x_c)[:, 0, 0] < 0).all()
         assert (np.asarray(found.x_c)[:, 1, 0] > 0).all()
-    one = search_field(field, points, parts, transforms, bones, mask, keep=1)
+    one = search_field(field, points, parts, transforms, table, keep=1)
     np.testing.assert_array_equal(one.valid.sum(1), 1)
-    np.testing.assert_array_equal(one.overflow, 1)
+    assert bool(one.more.all())
 
 
 def test_each_part_starts_from_its_own_bones():
     """Part 1 starts from the second bone alone, and finds its root alone."""
     field, transforms = two_bone_arm(FOLD)
     points = jnp.asarray(folded_points(), jnp.float32)
-    found = search_field(field, points, jnp.ones(len(points), int), transforms, BONES, MASK)
+    found = search_field(field, points, jnp.ones(len(points), int), transforms, STARTS)
     np.testing.assert_array_equal(np.asarray(found.valid).sum(1), 1)
     assert (np.asarray(found.x_c)[:, 0, 0] > 0).all()
     assert int(found.lanes) == len(points)
@@ -392,9 +393,9 @@ def test_a_point_that_is_not_finite_has_no_roots_and_harms_no_other(rng, arm_tab
     broken = points.at[7].set(jnp.array([0.0, jnp.nan, 0.0])).at[20].set(jnp.inf)
     rest = np.setdiff1d(np.arange(len(points)), [7, 20])
     for run in (
-        lambda p: search_field(field, p, parts, transforms, BONES, MASK, width=16),
+        lambda p: search_field(field, p, parts, transforms, STARTS, width=16),
         lambda p: search_grid(
-            pose_grid(arm_table, transforms), p, parts, transforms, BONES, MASK, width=16
+            pose_grid(arm_table, transforms), p, parts, transforms, STARTS, width=16
         ),
     ):
         good, bad = run(points), run(broken)
@@ -411,8 +412,9 @@ def test_the_number_of_lanes_stepped_together_changes_nothing(rng, width):
     field, transforms = two_bone_arm(1.2)
     points = cloud(rng, 1.2, 24)
     parts = jnp.zeros(len(points), int)
-    found = search_field(field, points, parts, transforms, BONES, MASK, width=width)
-    expected = search_field(field, points, parts, transforms, BONES, MASK)
+    # Only lanes of one block can be merged.
+    found = search_field(field, points, parts, transforms, STARTS, width=width, merge=0.0)
+    expected = search_field(field, points, parts, transforms, STARTS, merge=0.0)
     np.testing.assert_array_equal(found.valid, expected.valid)
     np.testing.assert_allclose(
         np.where(found.valid[..., None], found.x_c, 0),
@@ -420,3 +422,137 @@ def test_the_number_of_lanes_stepped_together_changes_nothing(rng, width):
         atol=1e-6,
     )
     assert int(found.steps) == int(expected.steps)
+
+
+def test_chunks_of_points_change_nothing(rng, arm_table):
+    points = cloud(rng, 1.2, 40)
+    parts = jnp.asarray(np.arange(len(points)) % 2)
+    grid = pose_grid(arm_table, arm_transforms(1.2))
+    whole = search_grid(grid, points, parts, arm_transforms(1.2), STARTS)
+    for chunk in (1, 16, len(points) - 1):
+        cut = search_grid(grid, points, parts, arm_transforms(1.2), STARTS, chunk=chunk)
+        np.testing.assert_array_equal(cut.valid, whole.valid)
+        keep = np.asarray(whole.valid)
+        np.testing.assert_allclose(
+            np.asarray(cut.x_c)[keep], np.asarray(whole.x_c)[keep], atol=1e-6
+        )
+        assert bool(jnp.all(cut.outcome == whole.outcome))
+        assert int(cut.lanes) == int(whole.lanes)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.6, 1.2], ids=["rest", "bent", "sharp"])
+def test_a_guided_search_gives_the_fields_own_roots(rng, arm_table, bend):
+    """Found on the grid, moved to the field: as the plain search on the field itself."""
+    field, transforms = two_bone_arm(bend)
+    x_c = rng.uniform([-0.4, -0.05, -0.05], [0.4, 0.05, 0.05], (150, 3))
+    points = jnp.asarray(arm_skin(x_c, bend), jnp.float32)
+    parts = jnp.zeros(len(points), int)
+    grid = pose_grid(arm_table, transforms)
+    fast = search_field(field, points, parts, transforms, STARTS, guide=grid)
+    plain = find(points, field, transforms)
+    near = eqx.tree_at(lambda p: p.found, plain, plain.found & arm_table.covers(plain.x_c))
+    assert_same_roots(near, fast, 2e-4, least=0.97)
+    roots = np.asarray(fast.x_c)
+    residual = np.linalg.norm(
+        arm_skin(roots.reshape(-1, 3), bend).reshape(roots.shape) - np.asarray(points)[:, None],
+        axis=-1,
+    )
+    assert residual[np.asarray(fast.valid)].max() < 1.1e-5
+    on_grid = search_grid(grid, points, parts, transforms, STARTS)
+    if bend:  # there is something to mend: trilinear weights are not the field's
+        moved = np.linalg.norm(np.asarray(on_grid.x_c)[:, 0] - roots[:, 0], axis=-1)
+        assert moved[np.asarray(fast.valid)[:, 0]].max() > 1e-5
+
+
+def test_merging_starts_changes_no_root(rng, arm_table):
+    points = cloud(rng, 1.2)
+    parts = jnp.zeros(len(points), int)
+    transforms = arm_transforms(1.2)
+    table = starts((0, 1, 0, 1, 0, 1))
+    grid = pose_grid(arm_table, transforms)
+    merged = search_grid(grid, points, parts, transforms, table)
+    alone = search_grid(grid, points, parts, transforms, table, merge=0.0)
+    np.testing.assert_array_equal(merged.valid, alone.valid)
+    keep = np.asarray(alone.valid)
+    np.testing.assert_allclose(
+        np.sort(np.where(keep[..., None], merged.x_c, 0), axis=1),
+        np.sort(np.where(keep[..., None], alone.x_c, 0), axis=1),
+        atol=1e-4,
+    )
+    assert int(merged.steps) < 0.8 * int(alone.steps)
+
+
+def test_the_outcome_says_what_became_of_each_point(arm_table):
+    field, transforms = two_bone_arm(0.6)
+    points = jnp.array(
+        [[0.1, 0.02, 0.0], [0.1, jnp.nan, 0.0], [0.1, 0.02, 0.0], [0.1, 0.02, 0.0], [9.0, 9.0, 9.0]]
+    )
+    parts = jnp.array([0, 0, 2, -1, 0])
+    grid = pose_grid(arm_table, transforms)
+    expected = [
+        Outcome.found, Outcome.not_finite, Outcome.no_start, Outcome.no_start, Outcome.outside
+    ]  # fmt: skip
+    for found in (
+        search_grid(grid, points, parts, transforms, STARTS),
+        search_field(field, points, parts, transforms, STARTS, guide=grid),
+    ):
+        for k, cause in enumerate(expected):
+            assert jax.tree.map(lambda leaf, k=k: leaf[k], found.outcome) == cause, k
+        np.testing.assert_array_equal(found.valid.any(1), [True, False, False, False, False])
+    few = search_grid(grid, points[:1], parts[:1], transforms, STARTS, max_steps=0)
+    assert jax.tree.map(lambda leaf: leaf[0], few.outcome) == Outcome.not_converged
+
+    class Jump(ArmField):
+        def __call__(self, x):  # far ends move away from where they are looked for
+            return 10.0 * super().__call__(x)
+
+    away = search_field(
+        Jump(jnp.asarray(20.0)), points[:1] + 0.5, parts[:1], transforms, STARTS, max_steps=3
+    )
+    assert jax.tree.map(lambda leaf: leaf[0], away.outcome) == Outcome.diverged
+
+
+@pytest.mark.parametrize("bad", ["shear", "nan", "zero"])
+def test_transforms_that_are_not_rigid_are_reported(arm_table, bad):
+    _, transforms = two_bone_arm(0.6)
+    broken = {
+        "shear": transforms.at[1, 0, 1].add(0.1),
+        "nan": transforms.at[1, 0, 3].set(jnp.nan),
+        "zero": transforms.at[1, :3, :3].set(0.0),
+    }[bad]
+    points, parts = jnp.array([[0.1, 0.02, 0.0]]), jnp.zeros(1, int)
+    found = search_grid(pose_grid(arm_table, broken), points, parts, broken, STARTS)
+    assert not found.valid.any()
+    assert jax.tree.map(lambda leaf: leaf[0], found.outcome) == Outcome.bad_transforms
+    scaled = transforms.at[:, :3].multiply(1.7)  # one scale is fine
+    again = search_grid(pose_grid(arm_table, scaled), 1.7 * points, parts, scaled, STARTS)
+    assert again.valid.any()
+
+
+def test_no_points_have_no_roots(arm_table):
+    field, transforms = two_bone_arm(0.6)
+    grid = pose_grid(arm_table, transforms)
+    empty = jnp.zeros((0, 3)), jnp.zeros(0, int)
+    for found in (
+        search_grid(grid, *empty, transforms, STARTS),
+        search_field(field, *empty, transforms, STARTS),
+        search_field(field, *empty, transforms, STARTS, guide=grid),
+    ):
+        assert found.valid.shape[0] == 0
+        assert int(found.lanes) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x_d": jnp.zeros(3)}, r"x_d has shape \(3,\), expected \('any', 3\)"),
+        ({"parts": jnp.zeros(3, int)}, r"parts has shape \(3,\), expected \(2,\)"),
+        ({"transforms": jnp.zeros((3, 4, 4))}, r"transforms has shape \(3, 4, 4\).*\(2, 4, 4\)"),
+    ],
+)
+def test_wrong_shapes(arm_table, change, message):
+    _, transforms = two_bone_arm(0.6)
+    given = {"x_d": jnp.zeros((2, 3)), "parts": jnp.zeros(2, int), "transforms": transforms}
+    grid = pose_grid(arm_table, transforms)
+    with pytest.raises(ValueError, match=message):
+        search_grid(grid, **{**given, **change}, starts=STARTS)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import TREES
 
 from xavatar_jax.body import PARTS
-from xavatar_jax.correspondence import check_bones, part_groups, start_table
-from xavatar_jax.kinematics import KinematicTree
+from xavatar_jax.correspondence import PAIR_ROWS, Group, check_bones, part_groups, start_table
+from xavatar_jax.correspondence.starts import pull_back_all
+from xavatar_jax.kinematics import KinematicTree, axis_angle_to_matrix
 
 BODY = (0, 1, 2, 4, 5, 16, 17, 18, 19)
 FACE = (12, 15, 22)
@@ -17,58 +19,119 @@ RIGHT = (21, *range(40, 55))
 FULL = (0, 1, 2, 4, 5, 15, 16, 17, 18, 19, *range(20, 55))
 
 
-def test_groups_of_smplx_are_the_published_ones():
-    groups = part_groups(TREES["smplx"])
-    assert dict(groups) == {
+FEET = (10, 11)
+NECK = (12,)
+
+
+def bones(groups):
+    return {part: group.bones for part, group in groups.items()}
+
+
+def test_paper_groups_of_smplx_are_the_published_ones():
+    groups = part_groups(TREES["smplx"], "paper")
+    assert bones(groups) == {
         "body": BODY, "face": FACE, "left_hand": LEFT, "right_hand": RIGHT,
         "eyes_mouth": FACE, "full": FULL,
     }  # fmt: skip
-    assert len(groups["full"]) == 45
+    assert not any(group.joints for group in groups.values())
+    assert len(groups["full"].bones) == 45
     assert len(BODY) == 9
 
 
+def test_own_groups_of_smplx_hold_the_published_ones():
+    groups = part_groups(TREES["smplx"])
+    assert groups["body"] == Group(tuple(sorted({*BODY, *FEET, *NECK})))
+    assert groups["face"] == groups["eyes_mouth"] == Group(FACE, FACE)
+    assert groups["left_hand"] == Group(LEFT, (25, 28, 31, 34, 37))
+    assert groups["right_hand"] == Group(RIGHT, (40, 43, 46, 49, 52))
+    assert groups["full"] == Group(FULL)
+
+
 def test_groups_of_smpl_and_mano():
-    assert part_groups(TREES["smpl"])["body"] == BODY
-    assert part_groups(TREES["smplh"])["left_hand"] == (20, *range(22, 37))
+    assert part_groups(TREES["smpl"], "paper")["body"].bones == BODY
+    assert part_groups(TREES["smplh"])["left_hand"].bones == (20, *range(22, 37))
     mano = part_groups(TREES["mano"])
-    assert mano["full"] == tuple(range(16))
-    assert mano["right_hand"] == tuple(range(16))
+    assert mano["full"].bones == tuple(range(16))
+    assert mano["right_hand"].bones == tuple(range(16))
 
 
 def test_a_tree_with_other_names_falls_back_to_all_it_has():
     tree = KinematicTree(("root", "a", "b", "c"), (-1, 0, 1, 0))
     groups = part_groups(tree)
-    assert all(group == (0, 1, 2, 3) for group in groups.values())
-    bones, mask = start_table(tree)
-    assert mask.all()
-    np.testing.assert_array_equal(bones, np.tile(np.arange(4), (len(PARTS), 1)))
+    assert all(group == Group((0, 1, 2, 3)) for group in groups.values())
+    table = start_table(tree)
+    assert table.mask.all()
+    np.testing.assert_array_equal(table.index, np.tile(np.arange(4), (len(PARTS), 1)))
+
+
+def rows(table):
+    return [
+        tuple(np.asarray(i)[np.asarray(m)]) for i, m in zip(table.index, table.mask, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("kind", TREES)
-@pytest.mark.parametrize("starts", ["part_aware", "body", "full"])
+@pytest.mark.parametrize("starts", ["part_aware", "paper", "body", "full"])
 def test_the_table_lists_each_parts_group(kind, starts):
     tree = TREES[kind]
-    bones, mask = start_table(tree, starts)
-    groups = part_groups(tree)
-    assert bones.shape == mask.shape
-    for row, part in enumerate(PARTS):
-        expected = groups[part if starts == "part_aware" else starts]
-        assert tuple(bones[row][mask[row]]) == expected
-    assert ((bones >= 0) & (bones < tree.num_joints)).all()  # the padding too
+    table = start_table(tree, starts)
+    by_part = starts in ("part_aware", "paper")
+    groups = part_groups(tree, starts if by_part else "paper")
+    assert table.index.shape == table.mask.shape == (len(PARTS), table.width)
+    for row, part in zip(rows(table), PARTS, strict=True):
+        group = groups[part if by_part else starts]
+        assert row == (*group.bones, *(tree.num_joints + j for j in group.joints))
+    # The padding too.
+    assert ((table.index >= 0) & (table.index < 2 * tree.num_joints)).all()
+
+
+def test_a_pair_of_parts_takes_the_starts_of_both():
+    table = start_table(TREES["smplx"], "paper", pairs=True)
+    found = rows(table)
+    assert len(found) == 15
+    for a in range(5):
+        assert PAIR_ROWS[a, a] == a
+        for b in range(5):
+            assert PAIR_ROWS[a, b] == PAIR_ROWS[b, a]
+            assert found[PAIR_ROWS[a, b]] == tuple(sorted({*found[a], *found[b]}))
+    assert sorted(np.unique(PAIR_ROWS)) == list(range(15))
 
 
 def test_groups_may_be_overridden():
-    bones, mask = start_table(TREES["smplx"], groups={"face": (15, 22, 23, 24)})
-    assert tuple(bones[1][mask[1]]) == (15, 22, 23, 24)
-    assert tuple(bones[0][mask[0]]) == BODY
+    tree = TREES["smplx"]
+    table = start_table(tree, "paper", groups={"face": (15, 22, 23, 24)})
+    assert rows(table)[1] == (15, 22, 23, 24)
+    assert rows(table)[0] == BODY
+    jaw = start_table(tree, groups={"face": Group((22,), joints=(22,))})
+    assert rows(jaw)[1] == (22, 55 + 22)
     with pytest.raises(ValueError, match=r"unknown part 'tail'; the parts are body"):
-        start_table(TREES["smplx"], groups={"tail": (1,)})
+        start_table(tree, groups={"tail": (1,)})
     with pytest.raises(ValueError, match=r"start bones of face: at least one bone"):
-        start_table(TREES["smplx"], groups={"face": ()})
+        start_table(tree, groups={"face": ()})
     with pytest.raises(ValueError, match=r"start bones of body: bone 55 is out of range for 55"):
-        start_table(TREES["smplx"], groups={"body": (0, 55)})
+        start_table(tree, groups={"body": (0, 55)})
+    with pytest.raises(ValueError, match=r"start joints of body: bone 55 is out of range for 55"):
+        start_table(tree, groups={"body": Group((0,), joints=(55,))})
     with pytest.raises(ValueError, match=r"unknown start set 'all'"):
-        start_table(TREES["smplx"], "all")  # pyright: ignore[reportArgumentType]
+        start_table(tree, "all")  # pyright: ignore[reportArgumentType]
+
+
+def test_starts_undo_one_bone_or_half_of_two(rng):
+    """Against LAPACK's inverses."""
+    tree = KinematicTree(("root", "a", "b"), (-1, 0, 1))
+    turns = axis_angle_to_matrix(jnp.asarray(rng.normal(scale=0.4, size=(3, 3))))
+    transforms = np.tile(np.eye(4), (3, 1, 1))
+    transforms[:, :3, :3] = turns
+    transforms[:, :3, 3] = rng.normal(size=(3, 3))
+    x = rng.normal(size=(5, 3))
+    halves = 0.5 * (transforms + transforms[[0, 0, 1]])
+    expected = [
+        [(np.linalg.inv(t) @ np.append(p, 1))[:3] for t in (*transforms, *halves)] for p in x
+    ]
+    found = pull_back_all(
+        jnp.asarray(x, jnp.float32), jnp.asarray(transforms, jnp.float32), start_table(tree)
+    )
+    np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 def test_bones_are_checked():

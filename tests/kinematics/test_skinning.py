@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from xavatar_jax.kinematics import (
     blend_transforms,
+    determinant_3x3,
     inverse_3x3,
     inverse_rigid,
     skin_points,
+    solve_3x3,
     transform_point,
     unskin_points,
 )
@@ -39,6 +41,14 @@ def test_inverse_3x3_agrees_with_numpy(matrix):
         found = inverse_3x3(jnp.asarray(matrix))
     expected = np.linalg.inv(matrix)
     np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
+def test_solutions_and_determinants_agree_with_numpy(x64, rng):
+    matrices, values = rng.normal(size=(4, 5, 3, 3)), rng.normal(size=(4, 5, 3))
+    found = solve_3x3(jnp.asarray(matrices), jnp.asarray(values))
+    np.testing.assert_allclose(found, np.linalg.solve(matrices, values[..., None])[..., 0])
+    np.testing.assert_allclose(determinant_3x3(jnp.asarray(matrices)), np.linalg.det(matrices))
+    assert not np.isfinite(solve_3x3(jnp.ones((3, 3)), jnp.ones(3))).any()
 
 
 def test_inverse_3x3_of_a_batch_and_of_a_singular_matrix(rng):

@@ -44,15 +44,13 @@ def query_posed(
     """
     transforms = bone_transforms(body, params)
     condition = fields.geometry.condition(params)
-    bones, mask = (jnp.asarray(v) for v in start_table(body.tree, starts))
     fixed_points, fixed_transforms, fixed_table = jax.lax.stop_gradient((points, transforms, table))
     roots = search_grid(
         pose_grid(fixed_table, fixed_transforms),
         fixed_points,
         parts,
         fixed_transforms,
-        bones,
-        mask,
+        start_table(body.tree, starts),
     )
     x_c = jax.lax.stop_gradient(roots.x_c)
     logits = jax.vmap(jax.vmap(lambda x: fields.geometry(x, condition)))(x_c)

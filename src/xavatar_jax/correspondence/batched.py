@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,66 +12,72 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ..fields import AbstractSkinningField, PosedGrid
+from ..fields import AbstractSkinningField, PosedGrid, skin_with_jacobian
 from ..kinematics import inverse_3x3, skin_points
 from .broyden import Broyden
-from .lanes import solve_lanes
+from .lanes import Solved, solve_lanes
 from .newton import ClosedFormNewton
-from .plain import DIVERGENCE, pull_back
+from .plain import DIVERGENCE
+from .roots import Outcome, Roots, distinct_roots, outcomes
+from .starts import StartTable, pull_back_all
 
 GRID_SOLVER = ClosedFormNewton(atol=1e-5, divergence=DIVERGENCE)
 FIELD_SOLVER = Broyden(atol=1e-5, divergence=DIVERGENCE)
-# Roots closer than this are one root found twice: ten times the search's tolerance and more.
-SAME_ROOT = 5e-4
+# Starts of a point that have come this close, in metres, are on their way to one root.
+MERGE = 1e-3
+# Points searched at a time: bounds memory, and costs nothing above a few thousand.
+CHUNK = 8192
+
+Solve = Callable[[Array, Array, Array], Solved]
+Covers = Callable[[Array], Array]
 
 
-class Roots(eqx.Module):
-    """Distinct roots of many posed points.
-
-    - `x_c`: `(P, K, 3)` metres; meaningful where `valid`.
-    - `valid`: `(P, K)`.
-    - `residual`: `(P, K)` metres, infinite where not valid.
-    - `overflow`: `(P,)` distinct roots that were found beyond K.
-    - `steps`: solver steps in all, and `lanes` the starts that took them.
-    """
-
-    x_c: Float[Array, "P K 3"]
-    valid: Bool[Array, "P K"]
-    residual: Float[Array, "P K"]
-    overflow: Int[Array, " P"]
-    steps: Int[Array, ""]
-    lanes: Int[Array, ""]
-
-
-@partial(jax.jit, static_argnames=("solver", "keep", "max_steps", "width"))
+@partial(jax.jit, static_argnames=("solver", "keep", "max_steps", "width", "merge", "chunk"))
 def search_grid(
     grid: PosedGrid,
     x_d: Float[Array, "P 3"],
     parts: Int[Array, " P"],
     transforms: Float[Array, "J 4 4"],
-    bones: Int[Array, "parts I"],
-    mask: Bool[Array, "parts I"],
+    starts: StartTable,
     *,
     solver: optx.AbstractRootFinder = GRID_SOLVER,
-    keep: int = 3,
+    keep: int = 4,
     max_steps: int = 15,
-    width: int = 4096,
+    width: int = 8192,
+    merge: float = MERGE,
+    chunk: int = CHUNK,
 ) -> Roots:
     """Roots of the tabulated field of one frame, for points with part labels.
 
-    `bones` and `mask` are `start_table`'s. Residuals are those of the interpolated field.
+    Newton's method with the exact Jacobian of the cell that an iterate lies in.
+
+    - `grid`: `pose_grid(tabulate(field, grids), transforms)`; residuals are those of the
+      interpolated field.
+    - `parts`: each point's row of `starts`, which `start_table` gives.
+    - `keep`: roots kept a point; `merge`: metres, 0 for never; `chunk`: points at a time.
+
+    **Raises:** `ValueError` when tracing for a wrong shape. What a point met at run time is its
+    `outcome`.
     """
 
     def residual(x: Array, target: Array) -> tuple[Array, Array]:
         point, jacobian = grid(x)
         return point - target, jacobian
 
-    start, target, active = _lanes(x_d, parts, transforms, bones, mask)
-    x_c, error, steps = solve_lanes(
-        solver, residual, start, target, active, max_steps=max_steps, width=width
-    )
-    valid = (error < solver.atol) & grid.grids.covers(x_c)
-    return _distinct(x_c, error, valid, steps, active, x_d.shape[0], keep)
+    def solve(start: Array, target: Array, active: Array) -> Solved:
+        return solve_lanes(
+            solver,
+            residual,
+            start,
+            target,
+            active,
+            max_steps=max_steps,
+            width=width,
+            group_size=starts.width,
+            merge=merge,
+        )
+
+    return _search(solve, grid.grids.covers, solver, x_d, parts, transforms, starts, keep, chunk)
 
 
 @eqx.filter_jit
@@ -78,15 +86,28 @@ def search_field(
     x_d: Float[Array, "P 3"],
     parts: Int[Array, " P"],
     transforms: Float[Array, "J 4 4"],
-    bones: Int[Array, "parts I"],
-    mask: Bool[Array, "parts I"],
+    starts: StartTable,
     *,
+    guide: PosedGrid | None = None,
     solver: Broyden = FIELD_SOLVER,
-    keep: int = 3,
+    keep: int = 4,
     max_steps: int = 50,
     width: int = 2048,
+    merge: float = MERGE,
+    chunk: int = CHUNK,
 ) -> Roots:
-    """The same on any field, by Broyden's method from the exact Jacobian at each start."""
+    """Roots of any field, for points with part labels.
+
+    Without a `guide`, by Broyden's method from the exact Jacobian at each start, one query of the
+    field a step. With a `guide`, the same field tabulated and posed, the search runs on that and
+    its few distinct roots are moved to the field's own by Newton's method: the residuals are the
+    field's, at a handful of queries a point. Other arguments are as for `search_grid`.
+    """
+    if guide is not None:
+        near = search_grid(
+            guide, x_d, parts, transforms, starts, keep=keep, merge=merge, chunk=chunk
+        )
+        return polish(field, near, x_d, transforms, atol=solver.atol, width=width)
 
     def residual(x: Array, target: Array) -> tuple[Array, None]:
         return skin_points(x, field(x), transforms) - target, None
@@ -95,49 +116,156 @@ def search_field(
         jacobian = jax.jacfwd(lambda v: residual(v, target)[0])(x)
         return {"inverse_jacobian": inverse_3x3(jacobian)}
 
-    start, target, active = _lanes(x_d, parts, transforms, bones, mask)
-    x_c, error, steps = solve_lanes(
+    def solve(start: Array, target: Array, active: Array) -> Solved:
+        return solve_lanes(
+            solver,
+            residual,
+            start,
+            target,
+            active,
+            options=options,
+            max_steps=max_steps,
+            width=width,
+            group_size=starts.width,
+            merge=merge,
+        )
+
+    covers = jax.vmap(field.covers)
+    return _search(solve, covers, solver, x_d, parts, transforms, starts, keep, chunk)
+
+
+def polish(
+    field: AbstractSkinningField,
+    roots: Roots,
+    x_d: Float[Array, "P 3"],
+    transforms: Float[Array, "J 4 4"],
+    *,
+    atol: float = 1e-5,
+    max_steps: int = 8,
+    width: int = 2048,
+) -> Roots:
+    """Roots of a nearby field moved to those of this one, by Newton's method.
+
+    Those that do not get there are dropped, and two that become one count once.
+    """
+    solver = ClosedFormNewton(atol=atol, divergence=DIVERGENCE)
+
+    def residual(x: Array, target: Array) -> tuple[Array, Array]:
+        posed, jacobian, _ = skin_with_jacobian(field, x, transforms)
+        return posed - target, jacobian
+
+    points, keep = roots.valid.shape
+    if not points:
+        return roots
+    solved = solve_lanes(
         solver,
         residual,
-        start,
-        target,
-        active,
-        options=options,
+        roots.x_c.reshape(-1, 3),
+        jnp.repeat(x_d, keep, axis=0),
+        roots.valid.reshape(-1),
         max_steps=max_steps,
         width=width,
     )
-    valid = (error < solver.atol) & jax.vmap(field.covers)(x_c)
-    return _distinct(x_c, error, valid, steps, active, x_d.shape[0], keep)
-
-
-def _lanes(
-    x_d: Array, parts: Array, transforms: Array, bones: Array, mask: Array
-) -> tuple[Array, Array, Array]:
-    chosen = bones[parts]  # (P, I)
-    start = jax.vmap(lambda x, b: pull_back(x, transforms[b]))(x_d, chosen)
-    width = chosen.shape[1]
-    target = jnp.repeat(x_d, width, axis=0)
-    active = mask[parts] & jnp.all(jnp.isfinite(x_d), axis=-1, keepdims=True)
-    return start.reshape(-1, 3), target, active.reshape(-1)
-
-
-def _distinct(
-    x_c: Array, error: Array, valid: Array, steps: Array, active: Array, points: int, keep: int
-) -> Roots:
-    x_c, error, valid = (v.reshape(points, -1, *v.shape[1:]) for v in (x_c, error, valid))
-    starts = valid.shape[1]
-    apart = jnp.sum((x_c[:, :, None] - x_c[:, None, :]) ** 2, axis=-1)
-    earlier = jnp.tril(jnp.ones((starts, starts), bool), -1)
-    repeated = jnp.any((apart < SAME_ROOT**2) & earlier & valid[:, None, :], axis=-1)
-    first = valid & ~repeated
-    order = jnp.argsort(~first, axis=1, stable=True)[:, :keep]
-    take = partial(jnp.take_along_axis, axis=1)
-    chosen = take(first, order)
-    return Roots(
-        x_c=jnp.take_along_axis(x_c, order[..., None], axis=1),
-        valid=chosen,
-        residual=jnp.where(chosen, take(error, order), jnp.inf),
-        overflow=jnp.maximum(jnp.sum(first, axis=1) - keep, 0),
-        steps=jnp.sum(jnp.where(active, steps, 0)),
-        lanes=jnp.sum(active),
+    valid = (solved.residual < atol) & jax.vmap(field.covers)(solved.y)
+    shaped = (points, keep)
+    x_c, error, valid, _ = distinct_roots(
+        solved.y.reshape(points, keep, 3),
+        solved.residual.reshape(shaped),
+        valid.reshape(shaped),
+        keep,
     )
+    lost = (roots.outcome == Outcome.found) & ~jnp.any(valid, axis=1)
+    where = jax.vmap(lambda gone, cause: Outcome.where(gone, Outcome.not_converged, cause))
+    outcome = where(lost, roots.outcome)
+    return Roots(
+        x_c, valid, error, outcome, roots.more, roots.steps + jnp.sum(solved.steps), roots.lanes
+    )
+
+
+def _search(
+    solve: Solve,
+    covers: Covers,
+    solver: Any,
+    x_d: Array,
+    parts: Array,
+    transforms: Array,
+    starts: StartTable,
+    keep: int,
+    chunk: int,
+) -> Roots:
+    """Search in chunks of points; `solve` drives the lanes that it is given."""
+    _check_shapes(x_d, parts, transforms, starts)
+    rigid = jnp.all(_rigid_up_to_scale(transforms))
+
+    def one_chunk(chunk: tuple[Array, Array]) -> Roots:
+        x, part = chunk
+        known = (part >= 0) & (part < starts.index.shape[0])
+        part = jnp.where(known, part, 0)
+        started = starts.mask[part] & known[:, None]
+        usable = started & rigid & jnp.all(jnp.isfinite(x), axis=-1, keepdims=True)
+        pulled = pull_back_all(x, transforms, starts)
+        start = jnp.take_along_axis(pulled, starts.index[part][..., None], axis=1)
+        target = jnp.repeat(x, starts.width, axis=0)
+        solved = solve(start.reshape(-1, 3), target, usable.reshape(-1))
+        converged = solved.residual < solver.atol
+        valid = converged & covers(solved.y)
+        residual, converged, valid = (
+            v.reshape(started.shape) for v in (solved.residual, converged, valid)
+        )
+        x_c, error, found, more = distinct_roots(
+            solved.y.reshape(*started.shape, 3), residual, valid, keep
+        )
+        outcome = outcomes(x, rigid, started, residual, converged, valid, solver.divergence)
+        steps, lanes = jnp.sum(solved.steps), jnp.sum(usable)
+        return Roots(x_c, found, error, outcome, more, steps, lanes)
+
+    points = x_d.shape[0]
+    if points <= chunk:
+        return one_chunk((x_d, parts)) if points else _no_roots(x_d, keep)
+    fill = -points % chunk
+    # Padding has no part, so it starts nowhere.
+    padded = jnp.pad(x_d, ((0, fill), (0, 0))), jnp.pad(parts, (0, fill), constant_values=-1)
+    rows = jax.lax.map(
+        one_chunk, jax.tree.map(lambda v: v.reshape(-1, chunk, *v.shape[1:]), padded)
+    )
+    steps, lanes = jnp.sum(rows.steps), jnp.sum(rows.lanes)
+    flat = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:points] if v.ndim > 1 else v, rows)
+    return eqx.tree_at(lambda r: (r.steps, r.lanes), flat, (steps, lanes))
+
+
+def _no_roots(x_d: Array, keep: int) -> Roots:
+    none = jnp.zeros((0, keep), bool)
+    zero = jnp.zeros((), jnp.int32)
+    outcome = jax.vmap(lambda _: Outcome.no_start)(x_d)
+    return Roots(
+        jnp.zeros((0, keep, 3), x_d.dtype),
+        none,
+        jnp.zeros((0, keep), x_d.dtype),
+        outcome,
+        none[:, 0],
+        zero,
+        zero,
+    )
+
+
+def _rigid_up_to_scale(transforms: Float[Array, "J 4 4"]) -> Bool[Array, " J"]:
+    linear = transforms[:, :3, :3]
+    gram = jnp.sum(linear[:, :, :, None] * linear[:, :, None, :], axis=1)
+    scale_sq = jnp.trace(gram, axis1=1, axis2=2) / 3
+    off = jnp.abs(gram - scale_sq[:, None, None] * jnp.eye(3, dtype=linear.dtype)).max((1, 2))
+    return (off < 1e-3 * scale_sq) & jnp.all(jnp.isfinite(transforms), axis=(1, 2))
+
+
+def _check_shapes(x_d: Any, parts: Any, transforms: Any, starts: StartTable) -> None:
+    for name, value, expected in (
+        ("x_d", x_d, (None, 3)),
+        ("parts", parts, (x_d.shape[0],)),
+        ("transforms", transforms, (len(starts.parents), 4, 4)),
+    ):
+        shape = jnp.shape(value)
+        fits = len(shape) == len(expected) and all(
+            e is None or s == e for s, e in zip(shape, expected, strict=True)
+        )
+        if not fits:
+            wanted = tuple("any" if e is None else e for e in expected)
+            raise ValueError(f"{name} has shape {shape}, expected {wanted}")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..fields import AbstractSkinningField, skin_with_jacobian
-from ..kinematics import inverse_3x3
+from ..kinematics import determinant_3x3, solve_3x3
 
 # Below this the map folds: the root's derivative grows without bound, so none is given.
 MIN_DETERMINANT = 0.05
@@ -29,14 +29,8 @@ def implicit_root(
     x_c = jax.lax.stop_gradient(x_c)
     posed, jacobian, weights = skin_with_jacobian(field, x_c, transforms)
     jacobian = jax.lax.stop_gradient(jacobian)
-    regular = jnp.abs(determinant(jacobian)) >= MIN_DETERMINANT
+    regular = jnp.abs(determinant_3x3(jacobian)) >= MIN_DETERMINANT
     # The inverse of a stand-in where it is singular: no NaN may enter the backward pass.
     safe = jnp.where(regular, jacobian, jnp.eye(3, dtype=jacobian.dtype))
-    step = (inverse_3x3(safe) * (posed - x_d)).sum(-1)
+    step = solve_3x3(safe, posed - x_d)
     return x_c - jnp.where(regular, step, 0.0), weights, regular
-
-
-def determinant(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
-    """Determinant of 3x3 matrices in closed form."""
-    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
-    return jnp.sum(a * jnp.cross(b, c), axis=-1)

@@ -1,95 +1,211 @@
-"""Many small solves at once, with the unfinished ones gathered.
+"""Many small solves at once, with the unfinished ones kept together.
 
 Under `vmap` a loop runs every lane until the last one ends, and some starts never converge: all
-lanes pay for the slowest. Here a fixed number of unfinished lanes is gathered, stepped and
-scattered back, until none is left; as lanes run out, fewer are gathered at a time. Shapes are
-fixed, so it works under `jit`.
+lanes pay for the slowest. Here lanes are taken block by block. A block is stepped as a whole; when
+so many of its lanes have ended that the rest fits a narrower block, the rest is gathered into one.
+Shapes are fixed, so it works under `jit`; nothing is scattered, which a compiler does slowly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+# Each narrower block is this share of the first: lanes run out quickly, then slowly.
+_NARROWER = (2, 8, 64)
+_LEAST_WIDTH = 16
+# Lanes of a group that are this many rows apart are not compared: bones of one limb or finger,
+# whose starts are the first to meet, stand together.
+_REACH = 12
+
+
+class Solved(NamedTuple):
+    """What became of L lanes.
+
+    - `y`: `(L, n)` the last iterate; `residual`: `(L,)` its norm, infinite for lanes that were not
+      active.
+    - `steps`: `(L,)`; `merged`: `(L,)` ended because another lane of its group had come to the
+      same place.
+    """
+
+    y: Float[Array, "L n"]
+    residual: Float[Array, " L"]
+    steps: Int[Array, " L"]
+    merged: Bool[Array, " L"]
+
+
+class _Block(NamedTuple):
+    """W lanes on their way. `going` is false for those that have ended."""
+
+    y: Float[Array, "W n"]
+    state: PyTree
+    args: PyTree
+    group: Int[Array, " W"]
+    going: Bool[Array, " W"]
+    steps: Int[Array, " W"]
+    merged: Bool[Array, " W"]
+
 
 def solve_lanes(
     solver: optx.AbstractRootFinder,
     fn: Callable[[Array, PyTree], tuple[Array, Any]],
-    start: Float[Array, "L 3"],
+    start: Float[Array, "L n"],
     args: PyTree,
     active: Bool[Array, " L"],
     *,
     options: Callable[[Array, PyTree], dict[str, Any]] | None = None,
     max_steps: int = 50,
     width: int = 4096,
-) -> tuple[Float[Array, "L 3"], Float[Array, " L"], Int[Array, " L"]]:
-    """Drive `solver` from every active lane's start; returns roots, residual norms and steps.
+    group_size: int = 1,
+    merge: float = 0.0,
+) -> Solved:
+    """Drive `solver` from every active lane's start.
 
     `fn(y, args)` is as for `optimistix.root_find(..., has_aux=True)`; the leaves of `args` have a
-    leading lane axis. `width` lanes are stepped together. Lanes that were not active have an
-    infinite residual. A lane ends by the solver's own `terminate`, or after `max_steps`.
+    leading lane axis. A lane ends by the solver's own `terminate`, or after `max_steps`. `width`
+    lanes are stepped together.
+
+    Every `group_size` lanes in a row look for roots of one equation. Where the residual of one has
+    fallen below `merge`, others that come this close to it end.
     """
     lanes = start.shape[0]
     width = min(width, lanes)
-    tags: frozenset[object] = frozenset()
-    make_options = options or (lambda y, a: {})
+    widths = [width, *(width // k for k in _NARROWER if width // k >= _LEAST_WIDTH)]
+    drive = _Driver(solver, fn, options or (lambda y, a: {}), max_steps, group_size, merge)
+    place = jnp.cumsum(active)  # of a lane among the active ones, from 1
+    group = jnp.arange(lanes) // group_size
 
-    def init(y: Array, a: PyTree) -> Any:
-        return solver.init(fn, y, a, make_options(y, a), None, None, tags)
+    def block(k: Array, out: Solved) -> Solved:
+        rows = _find(place, k * width, width)
+        y, own, of = _take((start, args, group), rows)
+        solved = drive.begin(y, own, of, rows < lanes, widths)
+        return jax.tree.map(
+            lambda all_, new: jax.lax.dynamic_update_slice_in_dim(all_, new, k * width, 0),
+            out,
+            solved,
+        )
 
-    def step(y: Array, a: PyTree, state: Any) -> tuple[Array, Any]:
-        y, state, _ = solver.step(fn, y, a, {}, state, tags)
-        return y, state
+    size = -(-lanes // width) * width
+    out = Solved(
+        jnp.zeros((size, *start.shape[1:]), start.dtype),
+        jnp.full(size, jnp.inf, start.dtype),
+        jnp.zeros(size, jnp.int32),
+        jnp.zeros(size, bool),
+    )
+    out = jax.lax.fori_loop(0, -(-place[-1] // width), block, out)
+    y, residual, steps, merged = _take(out, place - 1)
+    return Solved(
+        y,
+        jnp.where(active, residual, jnp.inf),
+        jnp.where(active, steps, 0),
+        active & merged,
+    )
 
-    def ended(y: Array, a: PyTree, state: Any) -> Array:
-        return solver.terminate(fn, y, a, {}, state, tags)[0]
 
-    # One lane more, a place for the padding of a gather to write to.
-    pad = lambda leaf: jnp.concatenate([leaf, leaf[:1]])  # noqa: E731
-    start, args = pad(start), jax.tree.map(pad, args)
-    struct = jax.eval_shape(init, start[0], jax.tree.map(lambda leaf: leaf[0], args))
-    states = jax.tree.map(lambda s: jnp.zeros((lanes + 1, *s.shape), s.dtype), struct)
-    fresh = jnp.concatenate([active, jnp.zeros(1, bool)])
+class _Driver(NamedTuple):
+    solver: optx.AbstractRootFinder
+    fn: Callable[[Array, PyTree], tuple[Array, Any]]
+    options: Callable[[Array, PyTree], dict[str, Any]]
+    max_steps: int
+    group_size: int
+    merge: float
 
-    def gather(mask: Array, size: int) -> Array:
-        return jnp.nonzero(mask, size=size, fill_value=lanes)[0]
+    def begin(
+        self, y: Array, args: PyTree, group: Array, active: Array, widths: list[int]
+    ) -> Solved:
+        """Solve one block from its starts."""
 
-    def begin(carry: tuple) -> tuple:
-        y, states, todo, fresh, steps = carry
-        rows = gather(fresh, width)
-        own = jax.tree.map(lambda leaf: leaf[rows], args)
-        state = jax.vmap(init)(y[rows], own)
-        going = ~jax.vmap(ended)(y[rows], own, state)
-        states = jax.tree.map(lambda all_, new: all_.at[rows].set(new), states, state)
-        todo = todo.at[rows].set(going).at[lanes].set(False)
-        return y, states, todo, fresh.at[rows].set(False), steps
+        def init(y: Array, a: PyTree) -> Any:
+            return self.solver.init(self.fn, y, a, self.options(y, a), None, None, frozenset())
 
-    def advance(size: int, carry: tuple) -> tuple:
-        y, states, todo, fresh, steps = carry
-        rows = gather(todo, size)
-        own = jax.tree.map(lambda leaf: leaf[rows], args)
-        state = jax.tree.map(lambda leaf: leaf[rows], states)
-        moved, state = jax.vmap(step)(y[rows], own, state)
-        count = steps[rows] + 1
-        going = ~jax.vmap(ended)(moved, own, state) & (count < max_steps)
-        states = jax.tree.map(lambda all_, new: all_.at[rows].set(new), states, state)
-        todo = todo.at[rows].set(going).at[lanes].set(False)
-        return y.at[rows].set(moved), states, todo, fresh, steps.at[rows].set(count)
+        state = jax.vmap(init)(y, args)
+        none = jnp.zeros_like(active)
+        steps = jnp.zeros(active.shape, jnp.int32)
+        block = _Block(y, state, args, group, active, steps, none)
+        return self.narrow(self.close(block), widths)
 
-    carry = (start, states, jnp.zeros(lanes + 1, bool), fresh, jnp.zeros(lanes + 1, jnp.int32))
-    carry = jax.lax.while_loop(lambda c: jnp.any(c[3]), begin, carry)
-    # The last lanes are those that never converge: a wide gather would be mostly padding.
-    sizes = [width, *(size for size in (width // 8, width // 64) if size >= 8)]
-    for size, smaller in zip(sizes, [*sizes[1:], 0], strict=True):
-        enough = partial(lambda least, c: jnp.sum(c[2]) > least, smaller)
-        carry = jax.lax.while_loop(enough, partial(advance, size), carry)
-    y, states, _, _, steps = carry
-    residual = jnp.sqrt(jnp.sum(states.residual**2, axis=-1))
-    residual = jnp.where(active, residual[:lanes], jnp.inf)
-    return y[:lanes], residual, steps[:lanes]
+    def narrow(self, block: _Block, widths: list[int]) -> Solved:
+        """Step until the rest fits the next width; go on with the rest alone."""
+        smaller = widths[1] if len(widths) > 1 else 0
+        block = jax.lax.while_loop(lambda b: jnp.sum(b.going) > smaller, self.advance, block)
+        residual = _norm(block.state)
+        solved = Solved(block.y, residual, block.steps, block.merged)
+        if not smaller:
+            return solved
+        place = jnp.cumsum(block.going)
+        rest = _take(block, _find(place, 0, smaller))
+        rest = rest._replace(going=jnp.arange(smaller) < place[-1])
+        after = _take(self.narrow(rest, widths[1:]), place - 1)
+        return _where(block.going, after, solved)
+
+    def advance(self, block: _Block) -> _Block:
+        """One step of every lane that is going."""
+
+        def step(y: Array, a: PyTree, state: Any) -> tuple[Array, Any]:
+            return self.solver.step(self.fn, y, a, {}, state, frozenset())[:2]
+
+        moved = jax.vmap(step)(block.y, block.args, block.state)
+        y, state = _where(block.going, moved, (block.y, block.state))
+        return self.close(block._replace(y=y, state=state, steps=block.steps + block.going))
+
+    def close(self, block: _Block) -> _Block:
+        """End the lanes that are done, by the solver's own rule, the count or another lane."""
+
+        def ended(y: Array, a: PyTree, state: Any) -> Array:
+            return self.solver.terminate(self.fn, y, a, {}, state, frozenset())[0]
+
+        done = jax.vmap(ended)(block.y, block.args, block.state)
+        going = block.going & ~done & (block.steps < self.max_steps)
+        if self.merge and self.group_size > 1:
+            near = _near_better(block, min(self.group_size - 1, _REACH), self.merge)
+            merged = going & near
+            return block._replace(going=going & ~near, merged=block.merged | merged)
+        return block._replace(going=going)
+
+
+def _near_better(block: _Block, reach: int, radius: float) -> Bool[Array, " W"]:
+    """Whether a lane of the same group is this near, is better, and is nearly there.
+
+    Only near a root do two lanes at one place end at one root: far from any, each has its chance.
+    """
+    size = block.y.shape[0]
+    pad = lambda v, fill: jnp.pad(v, (reach, reach), constant_values=fill)  # noqa: E731
+    group = pad(block.group, -1)
+    # Coordinates apart: the compiler then works on whole rows of lanes.
+    axes = [pad(block.y[:, k], jnp.inf) for k in range(block.y.shape[1])]
+    error = pad(_norm(block.state), jnp.inf)
+    here = slice(reach, reach + size)
+    found = jnp.zeros(size, bool)
+    for shift in (*range(-reach, 0), *range(1, reach + 1)):
+        other = slice(reach + shift, reach + shift + size)
+        apart = sum(((v[here] - v[other]) ** 2 for v in axes), jnp.zeros(()))
+        better = error[other] <= error[here] if shift < 0 else error[other] < error[here]
+        close = (apart < radius**2) & (error[other] < radius)
+        found |= (group[here] == group[other]) & close & better
+    return found
+
+
+def _norm(state: Any) -> Float[Array, " W"]:
+    return jnp.sqrt(jnp.sum(state.residual**2, axis=-1))
+
+
+def _find(place: Int[Array, " L"], first: Array | int, count: int) -> Int[Array, " count"]:
+    """Rows of the active lanes `first` to `first + count`; beyond the last row where none is."""
+    wanted = first + jnp.arange(1, count + 1, dtype=place.dtype)
+    return jnp.searchsorted(place, wanted)
+
+
+def _take(tree: Any, rows: Int[Array, " n"]) -> Any:
+    return jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), tree)
+
+
+def _where(mask: Bool[Array, " W"], new: Any, old: Any) -> Any:
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, new, old)

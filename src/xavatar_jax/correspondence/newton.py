@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
-from ..kinematics import inverse_3x3
+from ..kinematics import solve_3x3
 from .broyden import stopping_rule
 
 
@@ -58,7 +58,7 @@ class ClosedFormNewton(optx.AbstractRootFinder):
         tags: frozenset[object],
     ) -> tuple[Float[Array, "3"], NewtonState, PyTree]:
         del options, tags
-        step = (inverse_3x3(state.jacobian) * state.residual).sum(-1)
+        step = solve_3x3(state.jacobian, state.residual)
         length = jnp.sqrt(jnp.sum(step**2))
         # Also catches the step of a singular Jacobian, which is not finite: stay put, and stop.
         scale = jnp.where(length > self.max_step, self.max_step / length, 1.0)

@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..fields import AbstractSkinningField
-from ..kinematics import inverse_3x3, skin_points
+from ..kinematics import inverse_3x3, skin_points, solve_3x3
 from .broyden import Broyden
 from .starts import check_bones
 
@@ -113,8 +113,8 @@ def find_correspondences(
         error = residual(place, safe_args)
         jacobian = jax.jacfwd(residual)(place, jax.lax.stop_gradient(safe_args))
         usable = ok & jnp.all(jnp.isfinite(inverse_3x3(jacobian)))
-        inverse = inverse_3x3(jnp.where(usable, jacobian, jnp.eye(3, dtype=jacobian.dtype)))
-        step = (inverse * (error - jax.lax.stop_gradient(error))).sum(-1)
+        safe = jnp.where(usable, jacobian, jnp.eye(3, dtype=jacobian.dtype))
+        step = solve_3x3(safe, error - jax.lax.stop_gradient(error))
         return jnp.where(usable, place - step, root)
 
     starts = jax.lax.stop_gradient(pull_back(x_d, transforms[bones]))
@@ -124,4 +124,4 @@ def find_correspondences(
 def pull_back(x_d: Float[Array, "3"], transforms: Float[Array, "I 4 4"]) -> Float[Array, "I 3"]:
     """$B_i^{-1} x_d$ for each bone: where a point would be if it belonged to that bone alone."""
     linear = transforms[..., :3, :3]
-    return (inverse_3x3(linear) * (x_d - transforms[..., :3, 3])[..., None, :]).sum(-1)
+    return solve_3x3(linear, x_d - transforms[..., :3, 3])

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)
+CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)
 
 
 @dataclass(frozen=True)
@@ -106,14 +106,14 @@ class PartGrids(eqx.Module):
 def lerp_weights(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8"]:
     """Weights of a cell's eight nodes at a position in it."""
     f = fraction[..., None, :]
-    return jnp.where(_CORNERS == 1, f, 1 - f).prod(-1)
+    return jnp.where(CORNERS == 1, f, 1 - f).prod(-1)
 
 
 def lerp_slopes(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8 3"]:
     """Derivatives of `lerp_weights` with respect to the position in the cell."""
     f = fraction[..., None, :]
-    factor = jnp.where(_CORNERS == 1, f, 1 - f)
-    sign = jnp.asarray(np.where(_CORNERS == 1, 1.0, -1.0), fraction.dtype)
+    factor = jnp.where(CORNERS == 1, f, 1 - f)
+    sign = jnp.asarray(np.where(CORNERS == 1, 1.0, -1.0), fraction.dtype)
     yz, xz, xy = (
         factor[..., 1] * factor[..., 2],
         factor[..., 0] * factor[..., 2],
@@ -175,7 +175,7 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         near = _cells_near(origin, shape, step, band, points)
         flat = np.flatnonzero(near.ravel())
         ijk = np.stack(np.unravel_index(flat, near.shape), 1)
-        corner = ijk[:, None, :] + _CORNERS
+        corner = ijk[:, None, :] + CORNERS
         stride = np.array([(shape[1] + 1) * (shape[2] + 1), shape[2] + 1, 1])
         unique, inverse = np.unique(corner @ stride, return_inverse=True)
         position = np.stack(np.unravel_index(unique, tuple(shape + 1)), 1)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..kinematics import KinematicTree, skin_points
-from .grids import PartGrids
+from .grids import CORNERS, PartGrids
 from .hierarchical import SOFT_BLEND, hierarchical_softmax, num_logits
 from .mlp import ImplicitMLP, MLPShape
 
@@ -107,12 +107,26 @@ class PosedGrid(eqx.Module):
 
     def __call__(self, x_c: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """The posed point and the exact Jacobian of the interpolated map."""
-        value, gradient = self.grids.interpolate_with_gradient(self.node_transforms, x_c)
-        transform = value.reshape(3, 4)
-        homogeneous = jnp.concatenate([x_c, jnp.ones(1, x_c.dtype)])
-        point = (transform * homogeneous).sum(-1)
-        slope = (gradient.reshape(3, 4, 3) * homogeneous[None, :, None]).sum(1)
-        return point, transform[:, :3] + slope
+        cell, u, spacing = self.grids.locate(x_c)
+        corners = self.node_transforms[self.grids.cells[cell]].reshape(8, 3, 4)
+        # Corner by corner and axis by axis: a compiler turns this into vector code over points;
+        # the same sums as reductions over small axes are several times slower.
+        x, y, z = ((1 - u[k], u[k]) for k in range(3))
+        posed, linear, turn = [], [], [[], [], []]
+        for k, (i, j, l) in enumerate(CORNERS.tolist()):
+            c = corners[k]
+            carried = c[:, 0] * x_c[0] + c[:, 1] * x_c[1] + c[:, 2] * x_c[2] + c[:, 3]
+            weight = x[i] * y[j] * z[l]
+            posed.append(weight * carried)
+            linear.append(weight * c[:, :3])
+            for axis, slope in enumerate((y[j] * z[l], x[i] * z[l], x[i] * y[j])):
+                turn[axis].append((1 if (i, j, l)[axis] else -1) * slope * carried)
+        slope = jnp.stack([_total(terms) for terms in turn], axis=-1) / spacing
+        return _total(posed), _total(linear) + slope
+
+
+def _total(terms: list[Array]) -> Array:
+    return sum(terms[1:], terms[0])
 
 
 def tabulate(

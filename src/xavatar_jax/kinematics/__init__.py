@@ -2,8 +2,10 @@
 
 from .forward import forward_kinematics as forward_kinematics
 from .forward import relative_transforms as relative_transforms
+from .inverse import determinant_3x3 as determinant_3x3
 from .inverse import inverse_3x3 as inverse_3x3
 from .inverse import inverse_rigid as inverse_rigid
+from .inverse import solve_3x3 as solve_3x3
 from .rotations import axis_angle_to_matrix as axis_angle_to_matrix
 from .rotations import matrix_to_axis_angle as matrix_to_axis_angle
 from .skinning import blend_transforms as blend_transforms

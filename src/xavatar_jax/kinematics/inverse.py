@@ -8,10 +8,42 @@ from jaxtyping import Array, Float
 
 def inverse_3x3(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Inverse by cofactors. A singular matrix gives infinities or NaN: mask by the determinant."""
-    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
-    bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
-    determinant = jnp.sum(a * bc, axis=-1)
-    return jnp.stack([bc, ca, ab], axis=-1) / determinant[..., None, None]
+    cofactors, determinant = _cofactors(matrix)
+    rows = [jnp.stack([cofactors[j][i] for j in range(3)], axis=-1) for i in range(3)]
+    return jnp.stack(rows, axis=-2) / determinant[..., None, None]
+
+
+def solve_3x3(
+    matrix: Float[Array, "*batch 3 3"], value: Float[Array, "*batch 3"]
+) -> Float[Array, "*batch 3"]:
+    """The solution of `matrix @ x = value`, by cofactors. Singular: infinities or NaN."""
+    cofactors, determinant = _cofactors(matrix)
+    v = [value[..., k] for k in range(3)]
+    rows = [sum(cofactors[j][i] * v[j] for j in range(3)) for i in range(3)]
+    return jnp.stack([row / determinant for row in rows], axis=-1)
+
+
+def determinant_3x3(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
+    """Determinant in closed form."""
+    return _cofactors(matrix)[1]
+
+
+def _cofactors(matrix: Array) -> tuple[list[list[Array]], Array]:
+    """Signed minors `[i][j]`, and the determinant, entry by entry.
+
+    Written out because a compiler turns entries into vector code over the batch; products of rows
+    cost it twenty times as much.
+    """
+    m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
+    minors = [
+        [
+            m[(i + 1) % 3][(j + 1) % 3] * m[(i + 2) % 3][(j + 2) % 3]
+            - m[(i + 1) % 3][(j + 2) % 3] * m[(i + 2) % 3][(j + 1) % 3]
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
+    return minors, sum((m[0][j] * minors[0][j] for j in range(1, 3)), m[0][0] * minors[0][0])
 
 
 def inverse_rigid(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .inverse import inverse_3x3
+from .inverse import solve_3x3
 
 
 def blend_transforms(
@@ -46,5 +46,4 @@ def unskin_points(
 ) -> Float[Array, "*points 3"]:
     """Undo `skin_points` where the weights are known: $x = (\\sum_i w_i B_i)^{-1} x_d$."""
     blended = blend_transforms(weights, transforms)
-    shifted = x_d - blended[..., 3]
-    return (inverse_3x3(blended[..., :3]) * shifted[..., None, :]).sum(-1)
+    return solve_3x3(blended[..., :3], x_d - blended[..., 3])

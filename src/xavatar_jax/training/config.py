@@ -157,7 +157,7 @@ def paper() -> FitConfig:
         points=SamplingPlan(),
         skinning=SkinningConfig(kind="mlp"),
         geometry=GeometryConfig(kind="mlp"),
-        search=SearchConfig(cached=False, keep=16, max_steps=50),
+        search=SearchConfig(starts="paper", cached=False, keep=16, max_steps=50),
         losses=LossConfig(softness=0.0),
         optimiser=OptimiserConfig(),
     )

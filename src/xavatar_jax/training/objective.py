@@ -214,17 +214,16 @@ def _search(
     fields: AvatarFields, batch: Batch, config: FitConfig, tree: KinematicTree
 ) -> tuple[Float[Array, "B M K 3"], Bool[Array, "B M K"]]:
     """Roots of every point, searched on the field itself, inside the training step."""
-    bones, mask = (jnp.asarray(v) for v in start_table(tree, config.search.starts))
+    starts = start_table(tree, config.search.starts)
     skinning = jax.lax.stop_gradient(fields.skinning)
     solver = Broyden(atol=config.search.atol, divergence=1.0)
-    keep = min(config.search.keep, bones.shape[1])
+    keep = min(config.search.keep, starts.width)
 
     def one_frame(frame: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         found = search_field(
             skinning,
             *frame,
-            bones,
-            mask,
+            starts,
             solver=solver,
             keep=keep,
             max_steps=config.search.max_steps,

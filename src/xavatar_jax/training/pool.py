@@ -21,7 +21,7 @@ from ..fields import (
     tabulate,
 )
 from ..frames import Frame, Frames, nearest_part_labels
-from ..kinematics import inverse_3x3, skin_points
+from ..kinematics import skin_points, solve_3x3
 from ..sampling import sample_frame
 from .config import FitConfig
 
@@ -117,7 +117,7 @@ def find_roots(
 ) -> FramePool:
     """Search every point of the pool on the tabulated field, frame by frame."""
     table = tabulate_for_search(body, betas, skinning, config)
-    bones, mask = (jnp.asarray(v) for v in start_table(body.tree, config.search.starts))
+    starts = start_table(body.tree, config.search.starts)
     solver = ClosedFormNewton(atol=config.search.atol, divergence=1.0)
 
     @eqx.filter_jit
@@ -127,8 +127,7 @@ def find_roots(
             x,
             parts,
             transforms,
-            bones,
-            mask,
+            starts,
             solver=solver,
             keep=config.search.keep,
             max_steps=config.search.max_steps,
@@ -187,7 +186,7 @@ def polish_roots(
             def newton(x: Array, target: Array) -> Array:
                 _, jacobian = grid(x)
                 off = skin_points(x, field(x), transforms) - target
-                step = (inverse_3x3(jacobian) * off).sum(-1)
+                step = solve_3x3(jacobian, off)
                 # A root that has to go further than this was not this root.
                 ok = jnp.sum(step**2) < 0.02**2
                 return jnp.where(ok, x - step, x)
