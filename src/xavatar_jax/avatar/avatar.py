@@ -25,7 +25,7 @@ from ..body import (
     check_params,
     pose_body,
 )
-from ..correspondence import StartSet
+from ..correspondence import RowFinder, StartSet
 from ..fields import TabulatedSkinning
 from ..geometry import nearest_vertices
 from ..kinematics import skin_points
@@ -75,19 +75,22 @@ class Avatar:
     ) -> Query:
         """Everything the fields say of posed points: logit, canonical point, whether found.
 
-        Differentiable in points and parameters. A point's part, which decides the bones that
-        start its search, is that of the nearest vertex of the posed body.
+        Differentiable in points and parameters. A point's part, which decides what starts its
+        search, is that of the nearest vertex of the posed body; close to two parts it is both.
         """
-        points = jnp.asarray(points, jnp.float32)
+        finder = self._row_finder(self.posed_template(params))
+        return self._query(jnp.asarray(points, jnp.float32), params, finder, starts)
+
+    def _query(
+        self, points: Array, params: BodyParams, finder: RowFinder, starts: StartSet = "part_aware"
+    ) -> Query:
+        rows = jnp.asarray(finder(np.asarray(jax.lax.stop_gradient(points))))
         return query_posed(
-            self.fields,
-            self._table,
-            self.body,
-            points,
-            jnp.asarray(self._parts_of(points, params)),
-            self._own(params),
-            starts,
+            self.fields, self._table, self.body, points, rows, self._own(params), starts
         )
+
+    def _row_finder(self, template: Float[np.ndarray, "V 3"]) -> RowFinder:
+        return RowFinder(template, np.asarray(self.body.part_labels))
 
     def occupancy(
         self, points: Float[Array, "N 3"], params: BodyParams, *, starts: StartSet = "part_aware"
@@ -185,11 +188,6 @@ class Avatar:
         own = jax.lax.stop_gradient(self._own(params))
         return np.asarray(_posed(self.body, own), np.float64)
 
-    def _parts_of(self, points: Array, params: BodyParams) -> np.ndarray:
-        template = self.posed_template(params)
-        _, nearest = nearest_vertices(template, np.asarray(jax.lax.stop_gradient(points)))
-        return np.asarray(self.body.part_labels)[nearest].astype(np.int32)
-
     def _extract_canonical(self, cell: CellSizes | float | None, max_vertices: int | None) -> Mesh:
         neutral = canonical_params(self.body, jnp.asarray(self.betas))
         condition = self.fields.geometry.condition(neutral)
@@ -209,9 +207,10 @@ class Avatar:
     ) -> Mesh:
         template = self.posed_template(params)
         batch = 4096
+        finder = self._row_finder(template)
 
         def field(points: np.ndarray) -> np.ndarray:
-            answer = self.query(jnp.asarray(points), params)
+            answer = self._query(jnp.asarray(points, jnp.float32), params, finder)
             # Nowhere to be found is outside, by about the width of the learned step.
             return np.asarray(jnp.where(answer.found, answer.logit, -10.0))
 

@@ -33,11 +33,13 @@ def query_posed(
     table: TabulatedSkinning,
     body: BodyModel,
     points: Float[Array, "N 3"],
-    parts: Int[Array, " N"],
+    rows: Int[Array, " N"],
     params: BodyParams,
     starts: StartSet = "part_aware",
 ) -> Query:
     """Search on the tabulated field, keep the root with the largest logit, polish it.
+
+    `rows` are those of a start table with pairs: see `RowFinder`.
 
     Derivatives, with respect to points, pose and fields, pass the chosen root by the implicit
     function theorem.
@@ -48,9 +50,9 @@ def query_posed(
     roots = search_grid(
         pose_grid(fixed_table, fixed_transforms),
         fixed_points,
-        parts,
+        rows,
         fixed_transforms,
-        start_table(body.tree, starts),
+        start_table(body.tree, starts, pairs=True),
     )
     x_c = jax.lax.stop_gradient(roots.x_c)
     logits = jax.vmap(jax.vmap(lambda x: fields.geometry(x, condition)))(x_c)

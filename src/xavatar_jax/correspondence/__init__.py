@@ -8,6 +8,7 @@ from .broyden import BroydenState as BroydenState
 from .implicit import implicit_root as implicit_root
 from .lanes import Solved as Solved
 from .lanes import solve_lanes as solve_lanes
+from .nearby import RowFinder as RowFinder
 from .newton import ClosedFormNewton as ClosedFormNewton
 from .plain import Correspondences as Correspondences
 from .plain import find_correspondences as find_correspondences

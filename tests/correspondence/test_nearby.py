@@ -1,0 +1,30 @@
+"""Start rows of unlabelled points, against distances computed one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xavatar_jax.body import PARTS
+from xavatar_jax.correspondence import PAIR_ROWS, RowFinder
+
+
+def test_rows_are_of_the_nearest_part_and_of_another_close_by(rng):
+    vertices = rng.uniform(-0.05, 0.05, (30, 3))
+    labels = rng.integers(0, 4, 30)  # no vertex of the last part
+    points = np.concatenate([rng.uniform(-0.08, 0.08, (200, 3)), [[5.0, 5.0, 5.0]]])
+    rows = RowFinder(vertices, labels)(points)
+    away = np.linalg.norm(points[:, None] - vertices[None], axis=-1)
+    both = 0
+    for k, row in enumerate(rows):
+        by_part = np.array([away[k, labels == p].min(initial=np.inf) for p in range(len(PARTS))])
+        order = np.argsort(by_part)
+        second = order[1] if by_part[order[1]] <= 0.03 else order[0]
+        both += second != order[0]
+        assert row == PAIR_ROWS[order[0], second]
+    assert 10 < both < 190
+
+
+def test_points_that_are_not_finite_get_some_row():
+    finder = RowFinder(np.eye(3), np.array([0, 1, 2]))
+    rows = finder(np.array([[np.nan, 0, 0], [0, 0, 1.0]]))
+    assert rows.tolist() == [0, 2]
