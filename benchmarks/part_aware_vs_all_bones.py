@@ -121,7 +121,7 @@ def train(
     starts: StartSet,
 ) -> tuple[dict[str, Any], list[tuple[float, int, AvatarFields]]]:
     """Steps a second, and the fields as they were along the way, with seconds and steps."""
-    config = replace(config, search=replace(config.search, starts=starts))
+    config = replace(config, search=replace(config.search, starts=starts), report_every=5)
     way: list[tuple[float, int, AvatarFields]] = []
     clock = [time.perf_counter()]
 
@@ -137,7 +137,6 @@ def train(
         config,
         verbose=False,
         callback=keep,
-        report_every=5,
     ).history
     # Compilation ended before the first step that counts.
     way = [(elapsed - done.seconds["compile"], step, fields) for elapsed, step, fields in way]

@@ -4,6 +4,7 @@ Without arguments: the bundled body and capture, the quick preset, ten minutes o
 
     python examples/fit_grab.py
     python examples/fit_grab.py --model-dir MODELS --data GRAB_SUBJECT --out out/s1
+    python examples/fit_grab.py --resume        # after Ctrl-C, or to raise --steps
 
 `--data` takes a folder with train/*.npz and test/*.npz (AMASS "SMPL-X G" or GRAB), a subject's
 own folder of such files, the folders that X-Avatar's preparation makes, or meshes with
@@ -17,17 +18,25 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
 
 import xavatar_jax as xa
+from xavatar_jax.avatar import Fit
 from xavatar_jax.datasets import find_gender
 from xavatar_jax.meshing import Mesh
 from xavatar_jax.render import save_png, save_webp_animation
-from xavatar_jax.report import animation, metrics_record, metrics_table, preview, write_json
-from xavatar_jax.training import PRESETS
+from xavatar_jax.report import (
+    animation,
+    loss_curves,
+    metrics_record,
+    metrics_table,
+    preview,
+    write_json,
+)
+from xavatar_jax.training import PRESETS, Interrupted, TrainingError
 
 
 @dataclass
@@ -41,7 +50,7 @@ class Options:
     steps: int | None = None
     """Training steps, in place of the preset's."""
     minutes: float | None = None
-    """Stop training so many minutes after its start, whatever the steps."""
+    """Stop training so many minutes after the call of fit, whatever the steps."""
     seed: int = 0
     train_frames: int | None = None
     """Frames to learn from, chosen for their variety (0: all)."""
@@ -49,6 +58,8 @@ class Options:
     """Held-out frames to evaluate, spread over the sequences: a number or "all"."""
     prefit_steps: int | None = None
     """Steps that fit the first fields to the body's mean shape."""
+    resume: bool = False
+    """Go on from checkpoint.npz in the folder of --out, if there is one."""
     cache_dir: Path | None = None
     """In place of the user's cache folder."""
     data: Path | None = None
@@ -114,11 +125,22 @@ def main(options: Options) -> None:
             f"frames, {body.num_vertices} vertices, {body.source.describe()}",
             flush=True,
         )
-    result = xa.fit(capture.train, configure(options), cache=options.cache_dir, verbose=verbose)
+    result = xa.fit(
+        capture.train,
+        configure(options),
+        cache=options.cache_dir,
+        verbose=verbose,
+        checkpoint=out / "checkpoint.npz",
+        resume=options.resume,
+        log=out / "log.jsonl",
+    )
     avatar, history = result
     avatar.save(out / "avatar.npz")
     fitted = time.perf_counter()
-    evaluation = xa.evaluate(avatar, capture.test, num_frames=count, verbose=verbose)
+    # The held-out frames are read from here on, and nowhere before.
+    evaluation = xa.evaluate(
+        avatar, capture.test, learned_from=result.frames, num_frames=count, verbose=verbose
+    )
     # Step 0 is only a reference: a quarter of the frames are enough for it.
     few = max(len(evaluation.per_frame) // 4, 1)
     before = xa.evaluate(result.before, capture.test, num_frames=few, verbose=verbose)
@@ -129,13 +151,17 @@ def main(options: Options) -> None:
     save_png(out / "preview.png", preview(avatar, capture.test[len(capture.test) // 2]))
     save_webp_animation(animation(avatar, sequence), out / "animation.webp", fps=10)
     written += [out / "preview.png", out / "animation.webp"]
+    if history.steps:
+        save_png(out / "losses.png", loss_curves(history))
+        written.append(out / "losses.png")
+    written += [out / "checkpoint.npz", out / "log.jsonl"]
     finished = time.perf_counter()
     stages = history.seconds
     seconds = {
         "data": loaded - started + sum(stages.get(k, 0) for k in ("settle", "labels", "roots")),
         "prefit": stages["prefit"],
-        "compile": stages["compile"],
-        "train": stages["train"],
+        "compile": stages.get("compile", 0.0),
+        "train": sum(stages.get(k, 0) for k in ("train", "validation", "checkpoint")),
         "evaluate": evaluated - fitted,
         "pictures": finished - evaluated,
         "total": finished - started,
@@ -146,6 +172,7 @@ def main(options: Options) -> None:
         avatar,
         seconds,
         stages={name: round(value, 2) for name, value in stages.items()},
+        training=training_record(result),
         data=capture.name,
         notices=list(capture.notices),
     )
@@ -156,6 +183,18 @@ def main(options: Options) -> None:
         print("written:")
         for path in written:
             print(f"  {path}")
+
+
+def training_record(result: Fit) -> dict[str, Any]:
+    """How training ended, for the metrics."""
+    history = result.history
+    return {
+        "steps_done": history.steps_done,
+        "best_step": history.best_step,
+        "stopped": history.stopped,
+        "frames": len(result.frames),
+        "validation": history.validation[-1] if history.validation else None,
+    }
 
 
 def write_meshes(avatar: xa.Avatar, test: xa.Frames, out: Path) -> list[Path]:
@@ -176,5 +215,11 @@ def write_meshes(avatar: xa.Avatar, test: xa.Frames, out: Path) -> list[Path]:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Options, description=__doc__))
-    except (FileNotFoundError, ValueError) as error:
+    except Interrupted as stop:
+        print(f"\n{stop} On the command line that is: the same command with --resume.")
+        sys.exit(128 + stop.signal)
+    except KeyboardInterrupt:
+        print("\nstopped before or after training: nothing more was saved.")
+        sys.exit(130)
+    except (FileNotFoundError, TrainingError, ValueError) as error:
         sys.exit(f"error: {error}")

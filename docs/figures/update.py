@@ -37,6 +37,7 @@ _FIGURES = (
 _KEPT = (
     *(name for name, _, _ in _FIGURES),
     *("count", "before", "frames", "seconds", "stages", "preset", "seed", "steps"),
+    *("by_pose_distance", "training"),
     *("device", "cores", "peak_rss_mb", "commit", "versions"),
 )
 _ENTRIES = (
@@ -59,6 +60,8 @@ _ENTRIES = (
     ("optimiser.skinning_rate", "{}"),
     ("optimiser.schedule", "{}"),
     ("optimiser.clip", "{}"),
+    ("validation.every", "{}, steps"),
+    ("validation.patience", "{}, steps"),
     ("prefit_steps", "{}"),
 )
 _SEARCH = (
@@ -121,6 +124,18 @@ def stages_view(record: dict[str, Any]) -> str:
     return f"{_table(rows)}\n\n{_sentence(_machine(record))}."
 
 
+def distance_view(record: dict[str, Any]) -> str:
+    """Held-out figures by how far a pose is from those learned from."""
+    if "by_pose_distance" not in record:
+        return NOT_MEASURED
+    rows = [["", "degrees", "frames", *(f"Chamfer, {region}, mm" for region in REGIONS)]]
+    for name, group in record["by_pose_distance"].items():
+        low, high = group["pose_distance_deg"]
+        figures = [_number(group["cd_mm"][region], 2) for region in REGIONS]
+        rows.append([name, f"{low:.1f} to {high:.1f}", str(group["frames"]), *figures])
+    return f"{_table(rows)}\n\n{_sentence(_machine(record))}."
+
+
 def benchmark_view(record: dict[str, Any]) -> str:
     """One column a start set."""
     columns = record["rows"]
@@ -150,6 +165,7 @@ def presets_view() -> str:
 VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{METRICS}": accuracy_view,
     f"docs/figures/{METRICS} stages": stages_view,
+    f"docs/figures/{METRICS} distance": distance_view,
     f"docs/figures/{PART_AWARE}": benchmark_view,
 }
 _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)

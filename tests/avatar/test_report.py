@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 import xavatar_jax as xa
-from xavatar_jax.report import metrics_record, metrics_table, preview, write_json
+from xavatar_jax.report import (
+    loss_curves,
+    metrics_record,
+    metrics_table,
+    preview,
+    write_json,
+)
+from xavatar_jax.training import History
 
 FIGURES = ("cd_mm", "cd_max_mm", "nc", "iou", "iou_near", "iou_box", "count")
 
@@ -43,3 +50,19 @@ def test_preview_shows_the_person(run):
     # Body, two hands and a face, three pictures each: more than background.
     assert picture.shape[0] > 4 * 80
     assert picture.std() > 10
+
+
+def test_loss_curves_are_drawn_where_the_losses_are():
+    """A loss that falls by decades is a straight line from the upper left to the lower right."""
+    history = History()
+    for step in range(25, 501, 25):
+        history.record(step, {"loss": 10 ** (-step / 125), "gradient": 1e6, "found": 1.0})
+    picture = loss_curves(history, size=(700, 400)).astype(int)
+    assert picture.shape == (400, 700, 3)
+    red, _, blue = np.moveaxis(picture[:, 64:520], 2, 0)
+    rows, columns = np.nonzero(blue - red > 60)
+    fitted = np.polyfit(columns, rows, 1)
+    assert fitted[0] > 0
+    assert np.abs(np.polyval(fitted, columns) - rows).max() < 4
+    with pytest.raises(ValueError, match="nothing to draw"):
+        loss_curves(History())

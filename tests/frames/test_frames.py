@@ -177,3 +177,13 @@ def test_unreadable_meshes_name_the_file(tmp_path, name, content, message):
 def test_missing_mesh(tmp_path):
     with pytest.raises(FileNotFoundError, match="No mesh file at"):
         read_mesh(tmp_path / "none.ply")
+
+
+def test_a_mesh_inside_out_is_turned_round(toy_body):
+    vertices, faces = TETRA
+    meshes = [TETRA, (vertices, faces[:, ::-1])]
+    frames = Frames.from_meshes(meshes, some_params(toy_body, 2))
+    assert [frame.turned for frame in frames] == [False, True]
+    for frame in frames:
+        a, b, c = (frame.vertices[frame.faces[:, k]] - 0.2 for k in range(3))
+        assert ((np.cross(b - a, c - a) * a).sum(1) > 0).all()  # outwards from a point inside

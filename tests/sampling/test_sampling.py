@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from xavatar_jax.sampling import (
     SamplingPlan,
     bone_points,
     joint_targets,
+    pose_distance,
     sample_frame,
     signed_distance,
     varied_frames,
@@ -198,6 +200,35 @@ def test_varied_frames_pick_the_odd_ones_out(rng):
     np.testing.assert_array_equal(varied_frames(turned, 4), chosen)
     smiling = replace(params, expression=params.expression.at[40].set(5.0))
     assert 40 in varied_frames(smiling, 4)
+
+
+def test_frames_all_alike_are_chosen_once_each():
+    params = BodyParams.zeros(SimpleNamespace(tree=TREES["smplx"], num_joints=55, num_betas=1,
+                                              num_expression=1), (9,))  # fmt: skip
+    assert len(set(varied_frames(params, 5))) == 5
+
+
+def test_pose_distance_is_the_mean_square_angle_to_the_nearest_pose():
+    """One joint apart by an angle, of the 54 that count; two apart by the same; the root alone."""
+    angle = 0.6
+    pose = np.zeros((3, 55, 3))
+    pose[0, 17, 2] = angle
+    pose[1, [17, 40], 0] = 0.2 + angle
+    pose[2, 0] = [0, 2.0, 0]
+    known = np.zeros((2, 55, 3))
+    known[1, [17, 40], 0] = 0.2
+
+    def params(values):
+        count = len(values)
+        zeros = [jnp.zeros((count, n)) for n in (1, 2, 3)]
+        return BodyParams(jnp.asarray(values), *zeros, TREES["smplx"])
+
+    expected = np.rad2deg([angle / np.sqrt(54), angle * np.sqrt(2 / 54), 0])
+    np.testing.assert_allclose(pose_distance(params(pose), params(known)), expected, atol=0.02)
+    other = BodyParams(jnp.zeros((1, 24, 3)), *(jnp.zeros((1, n)) for n in (1, 2, 3)),
+                       TREES["smpl"])  # fmt: skip
+    with pytest.raises(ValueError, match="24 joints"):
+        pose_distance(other, params(known))
 
 
 @pytest.mark.parametrize("kind", PARENTS)

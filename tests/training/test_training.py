@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_runs import tiny
 
 import xavatar_jax as xa
-from xavatar_jax.fields import GridSpacing, MLPShape
-from xavatar_jax.frames import frames_from_params
+from xavatar_jax.fields import MLPShape
 from xavatar_jax.training import (
     PRESETS,
     TrainingError,
@@ -22,44 +22,22 @@ from xavatar_jax.training import (
 )
 from xavatar_jax.training import step as step_module
 from xavatar_jax.training.loop import train_pool
-from xavatar_jax.training.pool import find_roots, label_frames, polish_roots, tabulate_for_search
+from xavatar_jax.training.pool import label_frames, polish_roots, tabulate_for_search
 from xavatar_jax.training.progress import progress
 from xavatar_jax.training.step import draw_batch
-
-
-def tiny(config: xa.FitConfig) -> xa.FitConfig:
-    coarse = GridSpacing(body=0.04, hands=0.01, face=0.013, band=0.06)
-    points = replace(config.points, body=200, face=60, eyes_mouth=40, hand=100, box=20)
-    return replace(
-        config,
-        steps=12,
-        frames_per_step=2,
-        points_per_step=64,
-        train_frames=3,
-        points=points,
-        skinning=replace(config.skinning, grid=coarse, mlp=replace(config.skinning.mlp, width=32)),
-        search=replace(config.search, grid=coarse),
-    )
-
-
-@pytest.fixture(scope="module")
-def case():
-    body = xa.synthetic_body()
-    rng = np.random.default_rng(3)
-    pose = np.deg2rad(10) * rng.standard_normal((3, 55, 3))
-    frames = frames_from_params(body, xa.BodyParams.create(body, pose=pose))
-    config = tiny(xa.quick())
-    fields = fresh_fields(body, config)
-    with progress("", 3, verbose=False) as bar:
-        pool = label_frames(body, frames, config, bar=bar)
-        pool = find_roots(body, np.zeros(10), fields.skinning, pool, config, bar=bar)
-    return body, frames, config, fields, pool
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_config_survives_json(preset):
     config = PRESETS[preset]()
     assert config_from_dict(json.loads(json.dumps(config_to_dict(config)))) == config
+
+
+def test_a_config_of_an_older_file_gets_defaults_for_what_it_lacks():
+    values = config_to_dict(xa.quick())
+    for name in ("validation", "checkpoint_every", "report_every"):
+        del values[name]
+    assert config_from_dict(values) == xa.quick()
 
 
 def test_unknown_config_entry_is_named():
@@ -190,7 +168,7 @@ def test_paper_preset_takes_a_step(case):
         pool = label_frames(body, frames, config, bar=bar)
     done = train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
     terms = {name: values[-1] for name, values in done.history.terms.items()}
-    assert set(terms) == {"loss", "occupancy", "bone", "joint", "surface", "found"}
+    assert set(terms) == {*("loss", "gradient", "occupancy", "bone", "joint", "surface", "found")}
     assert all(np.isfinite(value) for value in terms.values())
     assert terms["found"] > 0.9
 

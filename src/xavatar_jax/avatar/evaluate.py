@@ -10,31 +10,70 @@ import numpy as np
 from ..frames import Frames, spread
 from ..meshing import Mesh
 from ..metrics import MeshMetrics, mean_metrics, surface_metrics
+from ..sampling import pose_distance
 from ..training.progress import progress
 from .avatar import Avatar
+
+GROUPS = ("near", "middle", "far")
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The mean over frames, each frame's own, and which frames they were."""
+    """The mean over frames, each frame's own, and which frames they were.
+
+    `pose_distance`: degrees from each frame's pose to the nearest training pose, where those
+    were given.
+    """
 
     mean: MeshMetrics
     per_frame: tuple[MeshMetrics, ...]
     sources: tuple[str, ...]
+    pose_distance: tuple[float, ...] | None = None
+
+    def by_pose_distance(self) -> dict[str, Evaluation]:
+        """Thirds of the frames, from those nearest to a training pose to those farthest from one.
+
+        Fewer than three frames make fewer groups. Empty if training poses were not given.
+        """
+        if self.pose_distance is None:
+            return {}
+        order = np.argsort(self.pose_distance, kind="stable")
+        groups = {}
+        for name, rows in zip(GROUPS, np.array_split(order, len(GROUPS)), strict=True):
+            if len(rows):
+                records = tuple(self.per_frame[k] for k in rows)
+                sources = tuple(self.sources[k] for k in rows)
+                distances = tuple(self.pose_distance[k] for k in rows)
+                groups[name] = Evaluation(mean_metrics(records), records, sources, distances)
+        return groups
 
     def to_json(self) -> dict[str, Any]:
-        """Nested plain values: the mean's figures, `per_frame` and `frames`."""
+        """Nested plain values: the mean's figures, `per_frame`, `frames`, `by_pose_distance`."""
         frames = [
             {"source": source, **record.to_json()}
             for source, record in zip(self.sources, self.per_frame, strict=True)
         ]
-        return {**self.mean.to_json(), "per_frame": frames, "frames": len(frames)}
+        values = {**self.mean.to_json(), "per_frame": frames, "frames": len(frames)}
+        if self.pose_distance is None:
+            return values
+        for frame, distance in zip(frames, self.pose_distance, strict=True):
+            frame["pose_distance_deg"] = distance
+        groups = {}
+        for name, group in self.by_pose_distance().items():
+            distances = group.pose_distance or ()
+            groups[name] = {
+                "pose_distance_deg": [min(distances), max(distances)],
+                "frames": len(distances),
+                **group.mean.to_json(),
+            }
+        return {**values, "by_pose_distance": groups}
 
 
 def evaluate(
     avatar: Avatar,
     frames: Frames,
     *,
+    learned_from: Frames | None = None,
     num_frames: int | None = 24,
     mode: Literal["fast", "full"] = "fast",
     seed: int = 0,
@@ -44,9 +83,13 @@ def evaluate(
 
     `num_frames` are spread evenly over the sequences (None: all). Parts are those of the nearest
     vertex of the posed body, as in the reference's protocol. See `surface_metrics` for the
-    figures.
+    figures. With `learned_from`, the frames of training (`Fit.frames`; only their poses are
+    read), figures are also given by how far a pose is from those learned: see `pose_distance`.
     """
     chosen = frames[spread(frames, num_frames)]
+    distances = None
+    if learned_from is not None:
+        distances = tuple(pose_distance(chosen.params, learned_from.params).tolist())
     labels = np.asarray(avatar.body.part_labels)
     records = []
     with progress("evaluation", len(chosen), verbose=verbose, unit="frame") as bar:
@@ -62,4 +105,4 @@ def evaluate(
                 )
             )
             bar.update(1)
-    return Evaluation(mean_metrics(records), tuple(records), chosen.sources)
+    return Evaluation(mean_metrics(records), tuple(records), chosen.sources, distances)

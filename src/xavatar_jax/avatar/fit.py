@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ..body import BodyModel
 from ..frames import Frames
 from ..training import (
-    AvatarFields,
+    Callback,
     FitConfig,
+    Fitted,
     History,
+    Interrupted,
+    TrainingError,
     fit_fields,
     quick,
     subject_betas,
@@ -22,11 +25,15 @@ from .avatar import Avatar
 
 @dataclass(frozen=True)
 class Fit:
-    """An avatar, the one it started from, and the way between. Unpacks to avatar and history."""
+    """An avatar, the one it started from, and the way between. Unpacks to avatar and history.
+
+    `frames`: those of the training frames that it was learned from.
+    """
 
     avatar: Avatar
     history: History
     before: Avatar
+    frames: Frames
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.avatar, self.history))
@@ -39,7 +46,11 @@ def fit(
     body: BodyModel | None = None,
     cache: str | os.PathLike[str] | None = None,
     verbose: bool = True,
-    callback: Callable[[int, AvatarFields, dict[str, float]], None] | None = None,
+    callback: Callback | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    log: str | os.PathLike[str] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> Fit:
     """Learn an avatar of the person in `frames`.
 
@@ -49,8 +60,20 @@ def fit(
     frames' betas. `cache` overrides the cache folder of the fields fitted to the body's mean
     shape; `verbose=False` is quiet.
 
-    **Raises:** `ValueError` naming the frame for parameters or meshes that cannot be used;
-    `TrainingError` if a loss is not finite.
+    The end of each sequence is not learned from: the fields that do best there are kept
+    (`config.validation`). Training may be watched and taken up again:
+
+    - `callback(step, fields, terms)` is called every 25 steps (`config.report_every`); `log` is a
+      file that gets one JSON object a line as often.
+    - `checkpoint` is a file that holds the whole run, written now and then, at the end, and when
+      training is stopped; `resume=True` goes on from it, with the numbers of an uninterrupted
+      run on the same machine.
+    - `devices` share each step: all that JAX sees, unless given.
+
+    **Raises:** `ValueError` naming the frame for parameters or meshes that cannot be used, or
+    what differs for a checkpoint of another run; `TrainingError` if a loss is not finite, and
+    `Interrupted` after Ctrl-C, both with what was learned until then as `error.fitted`, a `Fit`.
+    **Warns:** `TrainingNotice` naming frames whose mesh and parameters do not fit.
     """
     config = quick() if config is None else config
     body = frames.body if body is None else body
@@ -59,8 +82,27 @@ def fit(
             "these frames do not say which body they are for: pass body=load_body(...)"
         )
     betas = subject_betas(frames)
-    fitted = fit_fields(
-        body, frames, betas, config, cache=cache, verbose=verbose, callback=callback
-    )
-    avatar = Avatar(body, betas, fitted.fields, config, fitted.history.steps_done)
-    return Fit(avatar, fitted.history, Avatar(body, betas, fitted.initial, config, 0))
+
+    def finished(fitted: Fitted) -> Fit:
+        avatar = Avatar(body, betas, fitted.fields, config, fitted.history.best_step)
+        before = Avatar(body, betas, fitted.initial, config, 0)
+        return Fit(avatar, fitted.history, before, frames[fitted.learned_from])
+
+    try:
+        fitted = fit_fields(
+            body,
+            frames,
+            betas,
+            config,
+            cache=cache,
+            verbose=verbose,
+            callback=callback,
+            checkpoint=checkpoint,
+            resume=resume,
+            log=log,
+            devices=devices,
+        )
+    except (TrainingError, Interrupted) as error:
+        error.fitted = finished(error.fitted)
+        raise
+    return finished(fitted)

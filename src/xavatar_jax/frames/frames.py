@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Int8
 
 from ..body import BodyModel, BodyParams
 from ..files.meshes import check_mesh, read_mesh
+from ..geometry import enclosed_volume
 
 LoadMesh = Callable[[int], tuple[np.ndarray, np.ndarray]]
 PartLabels = np.ndarray | Callable[[int], np.ndarray | None] | None
@@ -28,6 +29,7 @@ class Frame:
         params: unbatched body parameters.
         part_labels: index into `body.PARTS` for each vertex, or None where unknown.
         source: where the frame comes from, for messages.
+        turned: whether the mesh was inside out, so that its triangles were turned round.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -35,6 +37,7 @@ class Frame:
     params: BodyParams
     part_labels: Int8[np.ndarray, " V"] | None
     source: str
+    turned: bool = False
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Frames(Sequence[Frame]):
 
     `frames[3]` is a `Frame`; `frames[10:20]` and `frames[np.array([1, 5])]` are `Frames` that
     share the loader. No mesh is kept, so memory does not grow with the number of frames.
+    A mesh whose triangles face inwards is turned round, which its frame says (`turned`).
 
     Args:
         params: body parameters, batched over the N frames.
@@ -203,7 +207,10 @@ class Frames(Sequence[Frame]):
                 f"{len(vertices)} vertices; expected ({len(vertices)},)."
             )
         params = _take(self._params, position)
-        return Frame(vertices, faces, params, labels, shared.names[i])
+        # Inside and outside are told by winding numbers, which need triangles that face outwards.
+        turned = enclosed_volume(vertices, faces) < 0
+        faces = faces[:, ::-1] if turned else faces
+        return Frame(vertices, faces, params, labels, shared.names[i], turned)
 
     def __repr__(self) -> str:
         return f"Frames({len(self)} frames, {len(set(self.sequence_index))} sequences)"

@@ -8,4 +8,5 @@ from .colormap import error_colors as error_colors
 from .picture import render_mesh as render_mesh
 from .save import save_png as save_png
 from .save import save_webp_animation as save_webp_animation
+from .sheet import draw_text as draw_text
 from .sheet import grid_picture as grid_picture

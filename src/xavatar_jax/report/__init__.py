@@ -1,5 +1,6 @@
 """What a run leaves behind: metrics, pictures, an animation, meshes."""
 
+from .curves import loss_curves as loss_curves
 from .machine import describe_machine as describe_machine
 from .metrics_file import metrics_record as metrics_record
 from .metrics_file import metrics_table as metrics_table

@@ -2,6 +2,7 @@
 
 from .bones import bone_points as bone_points
 from .bones import joint_targets as joint_targets
+from .frames import pose_distance as pose_distance
 from .frames import varied_frames as varied_frames
 from .labels import signed_distance as signed_distance
 from .points import FrameSamples as FrameSamples

@@ -1,9 +1,9 @@
-"""Which frames to learn from."""
+"""Which frames to learn from, and how far others are from them."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ..body import BodyParams, pose_groups
 from ..kinematics import axis_angle_to_matrix
@@ -13,8 +13,11 @@ def varied_frames(params: BodyParams, count: int) -> Int[np.ndarray, " n"]:
     """Indices of `count` frames that differ most in pose and expression, in rising order.
 
     Greedy farthest-point choice from the first frame, over the rotations of all joints but the
-    root (fingers count half, since there are many) and the expression. Deterministic.
+    root (fingers count half, since there are many) and the expression. Deterministic; no frame is
+    chosen twice, however alike they are.
     """
+    from scipy.spatial.distance import cdist
+
     total = len(params)
     if count >= total:
         return np.arange(total)
@@ -24,9 +27,40 @@ def varied_frames(params: BodyParams, count: int) -> Int[np.ndarray, " n"]:
     share[list(groups["left_hand_pose"] + groups["right_hand_pose"])] = 0.5
     features = (rotations * share[1:, None, None]).reshape(total, -1)
     features = np.concatenate([features, 0.3 * np.asarray(params.expression)], axis=1)
-    chosen = [0]
-    gap = ((features - features[0]) ** 2).sum(1)
-    while len(chosen) < count:
-        chosen.append(int(gap.argmax()))
-        gap = np.minimum(gap, ((features - features[chosen[-1]]) ** 2).sum(1))
-    return np.sort(np.asarray(chosen))
+    chosen: list[int] = []
+    gap = np.full(total, np.inf)
+    newest = 0
+    while True:
+        chosen.append(newest)
+        if len(chosen) == count:
+            return np.sort(np.asarray(chosen))
+        # cdist makes no array of the size of the features, which are large for long captures.
+        gap = np.minimum(gap, cdist(features, features[newest : newest + 1], "sqeuclidean")[:, 0])
+        gap[newest] = -np.inf  # among frames all alike, the farthest is still another one
+        newest = int(gap.argmax())
+
+
+def pose_distance(params: BodyParams, known: BodyParams) -> Float[np.ndarray, " n"]:
+    """How far each frame's pose is from the nearest of the known frames', degrees.
+
+    The distance of two poses is the root mean square of the angles between their joints'
+    rotations; the root, which turns the whole person, has no part in it.
+
+    **Raises:** `ValueError` if the two are for trees with different numbers of joints.
+    """
+    if params.tree.num_joints != known.tree.num_joints:
+        raise ValueError(
+            f"poses of {params.tree.num_joints} joints cannot be compared with poses of "
+            f"{known.tree.num_joints}"
+        )
+    first, second = (
+        np.asarray(axis_angle_to_matrix(p.pose), np.float64)[:, 1:].reshape(len(p), -1, 9)
+        for p in (params, known)
+    )
+    nearest = np.empty(len(first))
+    for k, rotation in enumerate(first):
+        # The trace of the relative rotation, joint by joint.
+        cosine = (np.einsum("njk,jk->nj", second, rotation) - 1) / 2
+        angle = np.arccos(np.clip(cosine, -1, 1))
+        nearest[k] = np.sqrt((angle**2).mean(1).min())
+    return np.rad2deg(nearest)

@@ -91,17 +91,41 @@ class OptimiserConfig:
 
 
 @dataclass(frozen=True)
+class ValidationConfig:
+    """Frames that training does not learn from: they decide when it stops and what is kept.
+
+    - `share`: of each training sequence, from its end; sequences shorter than `1 / share` give
+      none. 0: no validation, and the last fields are kept.
+    - `frames`: how many of these are asked, spread over the sequences; `points`: of each.
+    - `every`: steps between two validations.
+    - `patience`: steps without a gain after which training ends (0: never); with a cosine
+      schedule they count from half of the steps. `gain`: what counts as one, as a share of the
+      loss.
+    """
+
+    share: float = 0.1
+    frames: int = 12
+    points: int = 512
+    every: int = 50
+    patience: int = 300
+    gain: float = 0.005
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Everything that decides a run.
 
     - `steps`, `minutes`: whichever ends first; `minutes` counts from the call of `fit`.
-    - `train_frames`: frames drawn for their variety (0: all).
+    - `train_frames`: frames drawn for their variety (0: all). Memory grows with their number, and
+      not with that of the frames they are drawn from.
     - `points`: how many points a frame gives, and where.
     - `frames_per_step`, `points_per_step` (of each frame).
     - `skinning_every`, `skinning_points`: with stored roots, every so many steps the skinning
       field is updated from so many points a frame; the other steps update the geometry.
     - `polish_every`: steps after which stored roots follow the skinning field.
     - `prefit_steps`: steps that fit the geometry to the body's mean shape first, cached.
+    - `report_every`: steps after which terms are recorded, and log and callback are served.
+    - `checkpoint_every`: steps after which a checkpoint is written, where one is asked for.
     """
 
     preset: str = "quick"
@@ -115,12 +139,15 @@ class FitConfig:
     skinning_points: int = 128
     polish_every: int = 400
     prefit_steps: int = 200
+    report_every: int = 25
+    checkpoint_every: int = 250
     points: SamplingPlan = SamplingPlan()
     skinning: SkinningConfig = SkinningConfig()
     geometry: GeometryConfig = GeometryConfig()
     search: SearchConfig = SearchConfig()
     losses: LossConfig = LossConfig()
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    validation: ValidationConfig = ValidationConfig()
 
 
 def quick() -> FitConfig:
@@ -154,12 +181,14 @@ def paper() -> FitConfig:
         frames_per_step=4,
         points_per_step=6000,
         prefit_steps=2000,
+        checkpoint_every=1000,
         points=SamplingPlan(),
         skinning=SkinningConfig(kind="mlp"),
         geometry=GeometryConfig(kind="mlp"),
         search=SearchConfig(starts="paper", cached=False, keep=16, max_steps=50),
         losses=LossConfig(softness=0.0),
         optimiser=OptimiserConfig(),
+        validation=ValidationConfig(every=500, patience=10_000),
     )
 
 

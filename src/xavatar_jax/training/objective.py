@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from ..body import FACE, HANDS, BodyModel, BodyParams, canonical_joints, canonical_vertices
+from ..body import FACE, HANDS, BodyModel, canonical_joints, canonical_vertices
 from ..correspondence import Broyden, implicit_root, search_field, start_table
 from ..kinematics import KinematicTree
 from ..losses import binary_cross_entropy, soft_occupancy, squared_error
 from ..sampling import bone_points, joint_targets
+from .batch import Batch
 from .config import FitConfig
+from .devices import ONE_DEVICE, Devices
 from .model import AvatarFields
-
-
-class Batch(NamedTuple):
-    """Points of B frames, M each; the first Q of a frame may have further roots."""
-
-    points: Float[Array, "B M 3"]
-    parts: Int[Array, "B M"]
-    distance: Float[Array, "B M"]
-    root: Float[Array, "B M 3"]
-    others: Float[Array, "B Q K 3"]
-    others_valid: Bool[Array, "B Q K"]
-    transforms: Float[Array, "B J 4 4"]
-    params: BodyParams
 
 
 class Anchors(eqx.Module):
@@ -97,11 +86,19 @@ def skinning_objective(
 
 
 def full_objective(
-    fields: AvatarFields, batch: Batch, anchors: Anchors, config: FitConfig, key: PRNGKeyArray
+    fields: AvatarFields,
+    batch: Batch,
+    anchors: Anchors,
+    config: FitConfig,
+    key: PRNGKeyArray,
+    *,
+    devices: Devices = ONE_DEVICE,
 ) -> tuple[Float[Array, ""], Terms]:
     """All terms, with roots searched on the fields themselves (X-Avatar, eq. 9 to 12)."""
     conditions = jax.vmap(fields.geometry.condition)(batch.params)
-    roots, valid = _search(fields, batch, config, anchors.tree)
+    roots, valid = devices.apart(
+        lambda fields, batch: _search(fields, batch, config, anchors.tree), fields, batch
+    )
     chosen, found = jax.vmap(_best_root, in_axes=(None, 0, 0, 0))(fields, roots, valid, conditions)
     logit, regular = _logit_through_root(fields, chosen, batch, conditions)
     use = found & regular

@@ -23,6 +23,7 @@ from ..fields import (
 from ..frames import Frame, Frames, nearest_part_labels
 from ..kinematics import skin_points, solve_3x3
 from ..sampling import sample_frame
+from .check import FrameCheck
 from .config import FitConfig
 
 
@@ -65,11 +66,16 @@ def frame_labels(body: BodyModel, frame: Frame) -> Int[np.ndarray, " V"]:
 def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any) -> FramePool:
     """Draw and label the points of every frame. Roots come later.
 
-    Draws are keyed by seed and frame: the same frame gets the same points in any order.
+    One mesh is held at a time, and memory grows with the points kept: 29 bytes each, with their
+    roots. Draws are keyed by seed and place in `frames`.
+
+    **Warns:** `TrainingNotice` naming frames whose mesh and parameters do not fit.
     """
     points, parts, distance = [], [], []
+    check = FrameCheck(body)
     for k in range(len(frames)):
         frame = frames[k]
+        check.look(frame)
         rng = np.random.default_rng((config.seed, k))
         samples = sample_frame(frame, frame_labels(body, frame), config.points, rng)
         shift = np.asarray(frame.params.transl, np.float32)
@@ -77,6 +83,7 @@ def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any
         parts.append(samples.parts.astype(np.int8))
         distance.append(samples.distance)
         bar.update(1)
+    check.notify()
     params = centred(frames.params)
     transforms = eqx.filter_jit(jax.vmap(lambda p: bone_transforms(body, p)))(params)
     shape = (len(points), len(points[0]))

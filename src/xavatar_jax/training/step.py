@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,9 +13,11 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from .batch import Batch
 from .config import FitConfig
+from .devices import ONE_DEVICE, Devices
 from .model import AvatarFields, trainable_filter
-from .objective import Anchors, Batch, full_objective, geometry_objective, skinning_objective
+from .objective import Anchors, full_objective, geometry_objective, skinning_objective
 from .pool import FramePool
 
 
@@ -41,11 +44,30 @@ def make_optimiser(config: FitConfig, rate: float, steps: int) -> optax.Gradient
 
 
 def draw_batch(
-    pool: FramePool, config: FitConfig, points: int, several: int, key: PRNGKeyArray
+    pool: FramePool,
+    config: FitConfig,
+    points: int,
+    several: int,
+    key: PRNGKeyArray,
+    *,
+    held: int = 0,
 ) -> Batch:
-    """Random frames and `points` random points of each, `several` from those with many roots."""
-    frame_key, several_key, single_key = jax.random.split(key, 3)
-    chosen = jax.random.randint(frame_key, (config.frames_per_step,), 0, pool.points.shape[0])
+    """Random frames, none of the last `held`, and `points` random points of each."""
+    frame_key, *keys = jax.random.split(key, 3)
+    last = pool.points.shape[0] - held
+    chosen = jax.random.randint(frame_key, (config.frames_per_step,), 0, last)
+    return batch_of(pool, chosen, points, several, *keys)
+
+
+def batch_of(
+    pool: FramePool,
+    chosen: Int[Array, " B"],
+    points: int,
+    several: int,
+    several_key: PRNGKeyArray,
+    single_key: PRNGKeyArray,
+) -> Batch:
+    """`points` random points of each chosen frame, `several` from those with many roots."""
     # A frame without points of several roots gives its first ones, which have none but one.
     first = jnp.minimum(pool.several[chosen], pool.others.shape[1])
     rows = jnp.concatenate(
@@ -80,20 +102,33 @@ def _uniform_index(
     return low[:, None] + jnp.minimum((u * span).astype(jnp.int32), span - 1)
 
 
+def rows_with_several(pool: FramePool, points: int) -> int:
+    """How many of a frame's drawn points are taken from those with several roots: their share."""
+    share = float(pool.several.sum() / jnp.maximum(pool.found.sum(), 1))
+    return min(int(np.ceil(points * share)), points)
+
+
 def make_steps(
-    fields: AvatarFields, pool: FramePool, anchors: Anchors, config: FitConfig
+    fields: AvatarFields,
+    pool: FramePool,
+    anchors: Anchors,
+    config: FitConfig,
+    *,
+    held: int = 0,
+    devices: Devices = ONE_DEVICE,
 ) -> tuple[TrainState, dict[str, Step]]:
     """The first state, and the jitted steps `(state, pool) -> (state, terms)` by what they learn.
 
     With stored roots there is one for "geometry" and, if it is learned, one for "skinning"; with
-    roots searched in the step one for "both". Draws are keyed by seed and step number alone.
+    roots searched in the step one for "both". Draws are keyed by seed and step number alone, and
+    leave out the pool's last `held` frames. A step whose loss or gradient is not finite changes
+    nothing.
     """
     learned, fixed = eqx.partition(fields, trainable_filter(fields, config))
     # A copy: a step gives its input state's memory to the next one.
     learned = jax.tree.map(jnp.copy, learned)
     points = config.points_per_step
-    share = float(pool.several.sum() / jnp.maximum(pool.found.sum(), 1))
-    several = min(int(np.ceil(points * share)), points)
+    several = rows_with_several(pool, points)
     rates = config.optimiser
     plans: dict[str, tuple[Any, int, int, float, int]] = {}
     if config.search.cached:
@@ -108,12 +143,19 @@ def make_steps(
                 config.steps // config.skinning_every,
             )
     else:
-        plans["both"] = (full_objective, points, 0, rates.learning_rate, config.steps)
+        plans["both"] = (
+            partial(full_objective, devices=devices),
+            points,
+            0,
+            rates.learning_rate,
+            config.steps,
+        )
     optimisers, steps = {}, {}
     for name, (objective, count, many, rate, total) in plans.items():
         optimiser = make_optimiser(config, rate, total)
         optimisers[name] = optimiser.init(_own(learned, name))
-        steps[name] = _make_step(name, objective, optimiser, fixed, anchors, config, count, many)
+        draw = partial(draw_batch, config=config, points=count, several=many, held=held)
+        steps[name] = _make_step(name, objective, optimiser, fixed, anchors, config, draw, devices)
     return TrainState(learned, optimisers, jnp.zeros((), jnp.int32)), steps
 
 
@@ -135,8 +177,8 @@ def _make_step(
     fixed: AvatarFields,
     anchors: Anchors,
     config: FitConfig,
-    points: int,
-    several: int,
+    draw: Callable[..., Batch],
+    devices: Devices,
 ) -> Step:
     fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
     share = config.optimiser.skinning_rate / config.optimiser.learning_rate
@@ -149,7 +191,7 @@ def _make_step(
         pool, anchors, fixed_arrays = constant
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         batch_key, loss_key = jax.random.split(key)
-        batch = draw_batch(pool, config, points, several, batch_key)
+        batch = devices.spread(draw(pool, key=batch_key))
 
         def loss(own: Any) -> tuple[Array, dict[str, Array]]:
             learned = _with_own(state.learned, name, own)
@@ -168,8 +210,12 @@ def _make_step(
             )
         learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
         optimisers = {**state.optimisers, name: optimiser_state}
-        label = "loss" if name != "skinning" else "skinning_loss"
-        return TrainState(learned, optimisers, state.step + 1), {label: total, **terms}
+        after = TrainState(learned, optimisers, state.step + 1)
+        size = optax.tree.norm(gradient)
+        good = jnp.isfinite(total) & jnp.isfinite(size)
+        after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)
+        prefix = "skinning_" if name == "skinning" else ""
+        return devices.whole(after), {f"{prefix}loss": total, f"{prefix}gradient": size, **terms}
 
     return lambda state, pool: step((pool, anchors, fixed_arrays), state)
 

@@ -1,0 +1,74 @@
+"""Frames that training can use but that look wrong: said once, with their names."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..body import BodyModel
+from ..frames import Frame, posed_vertices
+from ..geometry import nearest_vertices
+
+MISFIT_M = 0.03
+_LOOKED_AT = 500  # vertices of the body that are compared with a mesh: enough for a median
+_NAMED = 8
+
+
+class TrainingNotice(UserWarning):
+    """Something about a training run was assumed, or looks wrong."""
+
+
+@dataclass
+class FrameCheck:
+    """What was seen of the frames so far; `notify` says it."""
+
+    body: BodyModel
+    misfits: list[tuple[str, float]] = field(default_factory=list)
+    turned: list[str] = field(default_factory=list)
+    seen: int = 0
+
+    def look(self, frame: Frame) -> None:
+        """Compare a mesh with the body in its pose, and note whether it was inside out."""
+        self.seen += 1
+        distance = misfit(self.body, frame)
+        if distance > MISFIT_M:
+            self.misfits.append((frame.source, distance))
+        if frame.turned:
+            self.turned.append(frame.source)
+
+    def notify(self) -> None:
+        """Warn (`TrainingNotice`) of frames that do not fit, and of meshes turned round."""
+        if self.misfits:
+            worst = sorted(self.misfits, key=lambda entry: -entry[1])
+            names = [f"{source} ({100 * distance:.1f} cm)" for source, distance in worst]
+            warnings.warn(
+                f"{len(names)} of {self.seen} frames do not fit their parameters: half of the "
+                f"posed body is more than {100 * MISFIT_M:.0f} cm from the mesh in "
+                f"{_listed(names)}. Training goes on; leave these frames out, or look for wrong "
+                "parameters, units or axes.",
+                TrainingNotice,
+                stacklevel=3,
+            )
+        if self.turned:
+            warnings.warn(
+                f"{len(self.turned)} of {self.seen} meshes were inside out and have been turned "
+                f"round: {_listed(self.turned)}.",
+                TrainingNotice,
+                stacklevel=3,
+            )
+
+
+def misfit(body: BodyModel, frame: Frame) -> float:
+    """Median distance, metres, from the body in the frame's pose to the nearest mesh vertices."""
+    posed = posed_vertices(body, frame.params)
+    chosen = posed[:: max(len(posed) // _LOOKED_AT, 1)]
+    distance, _ = nearest_vertices(frame.vertices, chosen)
+    return float(np.median(distance))
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

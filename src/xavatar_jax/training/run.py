@@ -1,0 +1,310 @@
+"""One run of training: steps, and what is done between them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NoReturn
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from .._version import __version__
+from ..body import BodyModel
+from .checkpoint import Keeper
+from .config import FitConfig, config_to_dict
+from .devices import Devices
+from .errors import Interrupted, TrainingError
+from .history import History
+from .interrupt import StopFlag, stop_between_steps
+from .log import JsonLines
+from .model import AvatarFields
+from .objective import make_anchors
+from .pool import FramePool, polish_roots, tabulate_for_search
+from .progress import progress
+from .step import make_steps, with_learned
+from .validation import Best, make_validation
+
+Callback = Callable[[int, AvatarFields, dict[str, float]], None]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Fields at step 0 and at the end, the way between, and the frames learned from."""
+
+    initial: AvatarFields
+    fields: AvatarFields
+    history: History
+    learned_from: Int[np.ndarray, " t"]
+
+
+class Run:
+    """A run's state, and what changes it. See `train_pool` for the arguments."""
+
+    def __init__(
+        self,
+        body: BodyModel,
+        start: AvatarFields,
+        pool: FramePool,
+        betas: Any,
+        config: FitConfig,
+        *,
+        held: int,
+        seconds: float | None,
+        deadline: float | None,
+        callback: Callback | None,
+        history: History,
+        initial: AvatarFields,
+        learned_from: Int[np.ndarray, " t"],
+        keeper: Keeper | None,
+        log: JsonLines | None,
+        devices: Devices,
+    ):
+        self.clock = time.perf_counter()
+        self.body, self.betas, self.start, self.initial = body, betas, start, initial
+        self.config = replace(
+            config, points_per_step=min(config.points_per_step, pool.points.shape[1])
+        )
+        self.seconds, self.deadline = seconds, deadline
+        self.callback, self.history, self.learned_from = callback, history, learned_from
+        self.keeper, self.log, self.devices = keeper, log, devices
+        self.first = jax.process_index() == 0  # of several hosts, the one that writes
+
+        anchors = devices.replicate(make_anchors(body, jnp.asarray(betas), config))
+        # The fields at the start, whose frozen leaves serve every step, where the steps run.
+        self.base = devices.replicate(start)
+        state, self.steps = make_steps(
+            self.base, pool, anchors, self.config, held=held, devices=devices
+        )
+        self.validation = None
+        if held:
+            self.validation = make_validation(pool, anchors, self.config, held)
+        self.best = Best()
+        self.latest: dict[str, Any] = {}
+        self.at = 0
+        saved = None if keeper is None else keeper.saved
+        if saved is not None:
+            self.best = saved.best(state.learned)
+            self.latest.update(saved.latest)
+            state, self.at = saved.state(state), saved.step
+            self.best = replace(self.best, learned=devices.replicate(self.best.learned))
+        self.state, self.pool = devices.replicate(state), devices.replicate(pool)
+        self.began, self.trained = self.at, history.seconds.get("train", 0.0)
+        self.compiled: set[str] = set()
+        self.unchecked: tuple[int, dict[str, Any]] | None = None
+        self._write({"event": "start" if saved is None else "resume", **self._head()})
+
+    def to_the_end(self, *, verbose: bool) -> Fitted:
+        """Steps until there are enough, time is up, nothing is gained, or somebody stops it."""
+        show = verbose and self.first
+        total = self.config.steps
+        with progress("training", total, verbose=show, unit="step") as bar:
+            bar.update(self.at)
+            with stop_between_steps() as flag:
+                reason = self._reason(flag)
+                while not reason:
+                    self._advance()
+                    bar.update(1)
+                    reason = self._between(flag, bar)
+        if self.validation is not None and self.at not in self.history.validated:
+            self._validate()
+        self._finish(reason)
+        return self.fitted()
+
+    def fitted(self) -> Fitted:
+        """The best fields so far, or the latest where there are no validation frames."""
+        learned = self.state.learned if self.best.learned is None else self.best.learned
+        learned = self.devices.collect(jax.tree.map(jnp.copy, learned))
+        return Fitted(
+            self.initial, eqx.combine(learned, self.start), self.history, self.learned_from
+        )
+
+    def _advance(self) -> None:
+        """One step. The one before is looked at while this one runs."""
+        names, k = list(self.steps), self.at
+        # Each kind of step comes once at the start, where bad data shows.
+        late = names[-1] if k % self.config.skinning_every == 0 else names[0]
+        name = names[k] if k < len(names) else late
+        fresh = name not in self.compiled
+        if fresh:
+            self._book("train")
+        self.state, terms = self.steps[name](self.state, self.pool)
+        self.at += 1
+        previous, self.unchecked = self.unchecked, (self.at, terms)
+        self._check(previous)
+        self.latest.update(terms)
+        if fresh:
+            self._settle()
+            self.compiled.add(name)
+            self._book("compile")
+
+    def _between(self, flag: StopFlag, bar: Any) -> str:
+        """What is due after a step; why to stop, if so."""
+        config, k = self.config, self.at
+        polished = "skinning" in self.steps and k % config.polish_every == 0
+        validated = self.validation is not None and k % config.validation.every == 0
+        reported = k % self.config.report_every == 0
+        if polished or validated:
+            self._settle()
+        if polished:
+            self._polish()
+        if validated:
+            self._validate()
+        reason = self._reason(flag)
+        kept = self.keeper is not None and (bool(reason) or k % config.checkpoint_every == 0)
+        if reported or kept or reason:
+            self._settle()
+            self._report(bar)
+        if kept:
+            self.history.stopped = reason
+            self._save()
+        if reason == "interrupt":
+            self._interrupt(flag)
+        return reason
+
+    def _reason(self, flag: StopFlag) -> str:
+        """Why to stop now, or nothing."""
+        if self.at >= self.config.steps:
+            return "steps"
+        if self.best.plateau(self.at, self.config):
+            return "plateau"
+        # Hosts have clocks and signals of their own: they ask each other, and not at every step.
+        if jax.process_count() > 1 and self.at % self.config.report_every:
+            return ""
+        self._book("train")
+        used = self.history.seconds.get("train", 0.0) - self.trained
+        late = self.seconds is not None and used > self.seconds
+        late |= self.deadline is not None and time.perf_counter() > self.deadline
+        if self.devices.agree(flag.number != 0):
+            return "interrupt"
+        return "minutes" if self.devices.agree(late) else ""
+
+    def _polish(self) -> None:
+        """Let stored roots follow the skinning field; on one device, for it is little work."""
+        skinning = self.devices.collect(with_learned(self.base, self.state).skinning)
+        table = tabulate_for_search(self.body, self.betas, skinning, self.config)
+        pool = polish_roots(skinning, table, self.devices.collect(self.pool))
+        self.pool = self.devices.replicate(pool)
+
+    def _validate(self) -> None:
+        assert self.validation is not None
+        self._book("train")
+        fields = eqx.combine(self.state.learned, self.base)
+        loss = float(self.validation(fields, self.pool))
+        if not math.isfinite(loss):
+            self._fail(self.at, "validation", loss)
+        self.best.update(self.at, loss, self.state.learned, self.config.validation)
+        self.history.record_validation(self.at, loss)
+        self._book("validation")
+
+    def _report(self, bar: Any) -> None:
+        """Record the terms, and tell bar, log and callback."""
+        k, history = self.at, self.history
+        values = {name: float(value) for name, value in self.latest.items()}
+        self.latest = dict(values)
+        if k not in history.steps:
+            history.record(k, values)
+        self._book("train")
+        history.steps_done, history.best_step = k, self.best.step or k
+        if history.validated and history.validated[-1] == k:
+            values["validation"] = history.validation[-1]
+        used = history.seconds["train"] - self.trained
+        per_step = self.config.frames_per_step * self.config.points_per_step
+        rate = per_step * (k - self.began) / max(used, 1e-9)
+        bar.set_postfix(loss=f"{values.get('loss', math.nan):.4f}", points_s=f"{rate:,.0f}")
+        self._write({"step": k, "seconds": history.seconds["train"], **values})
+        if self.callback is not None and self.first:
+            learned = self.devices.collect(jax.tree.map(jnp.copy, self.state.learned))
+            self.callback(k, eqx.combine(learned, self.start), values)
+
+    def _save(self) -> None:
+        if self.keeper is None or not self.first:
+            return
+        self._book("train")
+        pool = self.pool if self.config.search.cached else None
+        self.keeper.save(self.state, self.best, self.history, pool, self.latest)
+        self._book("checkpoint")
+
+    def _finish(self, reason: str) -> None:
+        history = self.history
+        self._book("train")
+        history.steps_done, history.stopped = self.at, reason
+        history.best_step = self.at if self.best.learned is None else self.best.step
+        self._write({"event": "stop", "step": self.at, "reason": reason, "best": history.best_step})
+
+    def _settle(self) -> None:
+        """Wait for the latest step and look at it."""
+        previous, self.unchecked = self.unchecked, None
+        self._check(previous)
+
+    def _check(self, outcome: tuple[int, dict[str, Any]] | None) -> None:
+        """Stop if a term is not finite."""
+        if outcome is None:
+            return
+        step, terms = outcome
+        values = {name: float(value) for name, value in jax.device_get(terms).items()}
+        # The sum and its gradient come last: they are not finite because a term is not.
+        for name in sorted(values, key=lambda n: (n.endswith("gradient"), n.endswith("loss"))):
+            if not math.isfinite(values[name]):
+                self._fail(step, name, values[name])
+
+    def _fail(self, step: int, name: str, value: float) -> NoReturn:
+        """Keep the last good state and say which term is to blame."""
+        # A step that is not finite changes nothing, so the state is the one before it.
+        self.at = int(self.state.step)
+        self.latest = {
+            n: v for n, v in ((n, float(v)) for n, v in self.latest.items()) if math.isfinite(v)
+        }
+        self._finish("not finite")
+        self._save()
+        where = "as this error's `fitted`"
+        if self.keeper is not None:
+            where = f"in {self.keeper.path}"
+        raise TrainingError(
+            f"the {name} term is {value} at step {step}: training has stopped. The state before "
+            f"it is kept {where}. Lower the learning rate, or look for a frame whose mesh and "
+            "parameters do not belong together.",
+            step=step,
+            term=name,
+            fitted=self.fitted(),
+        )
+
+    def _interrupt(self, flag: StopFlag) -> NoReturn:
+        """Say what was kept and how to go on."""
+        self._finish("interrupt")
+        kept = (
+            "nothing was saved, since no checkpoint was asked for (checkpoint=FILE); the fields "
+            "until here are this error's `fitted`"
+        )
+        if self.keeper is not None:
+            kept = (
+                f"the run is kept in {self.keeper.path}; the same call with resume=True goes on "
+                "from there"
+            )
+        raise Interrupted(
+            f"stopped at step {self.at} of {self.config.steps}: {kept}.",
+            step=self.at,
+            signal=flag.number,
+            fitted=self.fitted(),
+        )
+
+    def _book(self, stage: str) -> None:
+        self.clock = self.history.lap(stage, self.clock)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        if self.log is not None:
+            self.log.write(record)
+
+    def _head(self) -> dict[str, Any]:
+        return {
+            "step": self.at,
+            "version": __version__,
+            "jax": jax.__version__,
+            "devices": self.devices.count,
+            "config": config_to_dict(self.config),
+        }

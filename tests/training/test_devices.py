@@ -1,0 +1,112 @@
+"""The same losses whether one device does a step or four share it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import xavatar_jax as xa
+from xavatar_jax.files import save_arrays
+from xavatar_jax.training.devices import ONE_DEVICE, share_work
+
+RUN = """
+import json, sys
+from dataclasses import replace
+import jax, jax.numpy as jnp, numpy as np
+import xavatar_jax as xa
+from small_runs import posed_frames, tiny
+from xavatar_jax.fields import MLPShape
+from xavatar_jax.files import load_arrays
+from xavatar_jax.training import fresh_fields
+from xavatar_jax.training.devices import share_work
+from xavatar_jax.training.loop import train_pool
+from xavatar_jax.training.pool import FramePool
+
+preset, frames_per_step, held, file = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
+config = tiny({"quick": xa.quick, "paper": xa.paper}[preset]())
+config = replace(
+    config, steps=6, report_every=1, polish_every=3, frames_per_step=frames_per_step,
+    points_per_step=32, skinning_points=16,
+    geometry=replace(config.geometry, mlp=MLPShape(width=48), log2_size=10),
+    search=replace(config.search, keep=2, max_steps=8),
+    validation=replace(config.validation, every=6, points=32),
+)
+body = xa.synthetic_body()
+arrays, _ = load_arrays(file)
+params = jax.tree.map(jnp.asarray, posed_frames(body, 3).params)
+pool = FramePool(params=params, **{name: jnp.asarray(value) for name, value in arrays.items()})
+fields = fresh_fields(body, config)
+result = {}
+for count in (1, 4):
+    devices = share_work(config, jax.devices()[:count])
+    done = train_pool(
+        body, fields, pool, np.zeros(10), config, held=held, verbose=False, devices=devices
+    )
+    leaf = jax.tree.leaves(done.fields)[0]
+    result[count] = {
+        "mesh": None if devices.mesh is None else dict(devices.mesh.shape),
+        "losses": done.history.terms["loss"], "validation": done.history.validation,
+        "devices": len(leaf.devices()),
+    }
+print("RESULT", json.dumps(result))
+"""
+
+
+def on_four_devices(*arguments: object) -> dict:
+    here = Path(__file__).parent
+    environment = {
+        **os.environ,
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join([str(here), str(Path(xa.__file__).parents[1])]),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, *map(str, arguments)],
+        env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.split("RESULT", 1)[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("preset", "frames", "held", "mesh"),
+    [
+        ("quick", 4, 0, {"frames": 4, "points": 1}),
+        ("paper", 2, 1, {"frames": 2, "points": 2}),
+    ],
+)
+def test_four_devices_give_the_losses_of_one(case, tmp_path, preset, frames, held, mesh):
+    """With stored roots, and with roots that each device searches for its own points."""
+    pool = case[4]
+    leaves = {f.name: getattr(pool, f.name) for f in fields(pool) if f.name != "params"}
+    save_arrays(tmp_path / "pool.npz", leaves, {})
+    result = on_four_devices(preset, frames, held, tmp_path / "pool.npz")
+    one, four = result["1"], result["4"]
+    assert one["mesh"] is None
+    assert four["mesh"] == mesh
+    assert one["devices"] == four["devices"] == 1  # what comes back is on one device
+    np.testing.assert_allclose(four["losses"], one["losses"], rtol=1e-4)
+    np.testing.assert_allclose(four["validation"], one["validation"], rtol=1e-4)
+
+
+def test_one_device_is_left_as_it_is():
+    config = xa.quick()
+    assert share_work(config, jax.devices()[:1]) is ONE_DEVICE
+    tree = {"a": np.arange(3), "b": "word"}
+    assert ONE_DEVICE.replicate(tree) is tree
+    assert ONE_DEVICE.agree(True)
+
+
+def test_a_batch_that_cannot_be_divided_is_refused():
+    config = replace(xa.quick(), frames_per_step=16, points_per_step=511)
+    with pytest.raises(ValueError, match=r"16 frames of 511 points.*multiple of 3, or points_per"):
+        share_work(config, [jax.devices()[0]] * 3)
