@@ -14,6 +14,8 @@ import pytest
 
 import xavatar_jax as xa
 from xavatar_jax.body import PARTS, SMPLX_TREE, canonical_pose, pose_groups
+from xavatar_jax.motion import FORMATS
+from xavatar_jax.motion.registry import WRITERS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -195,6 +197,13 @@ def test_canonical_table_is_the_canonical_pose(family):
         values = vector.strip("()").replace("π/6", str(np.pi / 6))
         pose[SMPLX_TREE.index(joint)] = [float(v) for v in values.split(",")]
     np.testing.assert_allclose(canonical_pose(family["smplx"]), pose, atol=1e-7)
+
+
+def test_motion_tables_are_the_formats():
+    rows = table("motion.md", "## Formats that are read")
+    assert [row[0] for row in rows] == list(FORMATS)
+    rows = table("motion.md", "## Formats that are written")
+    assert [row[0] for row in rows] == list(WRITERS)
 
 
 def test_packages_import_only_what_stands_above_them():

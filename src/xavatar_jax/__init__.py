@@ -27,7 +27,10 @@ from .frames import Frames as Frames
 from .kinematics import skin_points as skin_points
 from .meshing import Mesh as Mesh
 from .motion import Motion as Motion
+from .motion import MotionNotice as MotionNotice
+from .motion import concat as concat
 from .motion import load_motion as load_motion
+from .motion import save_motion as save_motion
 from .training import FitConfig as FitConfig
 from .training import paper as paper
 from .training import quick as quick

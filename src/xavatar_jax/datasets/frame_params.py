@@ -10,6 +10,7 @@ import numpy as np
 
 from ..body import BodyModel, BodyParams, hands_to_absolute, pose_groups
 from ..files import load_npz, load_pickle
+from ..motion.values import rotation_vectors
 
 _ALIASES = {
     "global_orient": ("global_orient", "root_orient"),
@@ -136,9 +137,7 @@ def _vector(values: np.ndarray, size: int, name: str, path: Path) -> np.ndarray:
     if values.size == size:
         return values.reshape(-1)
     if name != "transl" and values.size == 3 * size and values.shape[-2:] == (3, 3):
-        from scipy.spatial.transform import Rotation
-
-        return Rotation.from_matrix(values.reshape(-1, 3, 3)).as_rotvec().reshape(-1)
+        return rotation_vectors(values, size // 3, name=name, where=path, count=1).reshape(-1)
     if name in _HANDS and 0 < values.size < size:
         return values.reshape(-1)  # principal components
     raise ValueError(

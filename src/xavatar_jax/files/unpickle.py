@@ -1,8 +1,9 @@
 """Pickles and object arrays from strangers: data is read, code is refused.
 
-Body models and captures are published as pickles, some written with chumpy and Python 2. Reading
-them with `pickle.load` would run whatever the file says. Here only NumPy arrays, SciPy sparse
-matrices, built-in containers and chumpy's array wrapper (read as the array inside) are built.
+Body models, captures and motions are published as pickles, some written with chumpy and Python 2,
+some by joblib, some with PyTorch's tensors inside. Reading them with `pickle.load` would run
+whatever the file says. Here only NumPy arrays, SciPy sparse matrices, built-in containers and the
+arrays inside chumpy's, joblib's and PyTorch's wrappers are built.
 """
 
 from __future__ import annotations
@@ -17,6 +18,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy_format
+
+from .inline_arrays import (
+    JoblibArray,
+    decompress,
+    read_torch_storage,
+    rebuild_torch_tensor,
+    torch_dtype,
+)
 
 
 class UnsafePickleError(ValueError):
@@ -71,10 +80,29 @@ _ALLOWED |= {("numpy.dtypes", name) for name in dir(np.dtypes) if name.endswith(
 _SPARSE = {"csc_matrix", "csr_matrix", "coo_matrix", "csc_array", "csr_array", "coo_array"}
 
 
+# joblib stores a memory map as the plain array it is, but names its class.
+_STANDS_FOR = {("torch", "Size"): tuple, ("numpy", "memmap"): np.ndarray}
+
+
 class _RestrictedUnpickler(pickle.Unpickler):
+    def __init__(self, file: BinaryIO) -> None:
+        # latin1 reads the byte strings of arrays that Python 2 pickled.
+        super().__init__(file, encoding="latin1")
+        self._file = file
+
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
             return super().find_class(module.replace("numpy.core", "numpy._core"), name)
+        if (module, name) in _STANDS_FOR:
+            return _STANDS_FOR[module, name]
+        if (module, name) == ("joblib.numpy_pickle", "NumpyArrayWrapper"):
+            # The file must have no `peek`: then the unpickler reads no byte ahead of its opcodes.
+            members = {"file": self._file, "unpickle": staticmethod(_unpickle)}
+            return type("JoblibArray", (JoblibArray,), members)
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
+            return rebuild_torch_tensor
+        if (module, name) == ("torch.storage", "_load_from_bytes"):
+            return _torch_storage
         if module.startswith("scipy.sparse") and name in _SPARSE:
             return super().find_class("scipy.sparse", name)
         if module.split(".")[0] == "chumpy" and name in ("Ch", "Select", "MatVecMult", "Add"):
@@ -85,10 +113,27 @@ class _RestrictedUnpickler(pickle.Unpickler):
         )
 
 
+class _StorageUnpickler(_RestrictedUnpickler):
+    """For the pickles inside a PyTorch storage, which name its element type by a class."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        dtype = torch_dtype(name) if module == "torch" else None
+        return super().find_class(module, name) if dtype is None else dtype
+
+    def persistent_load(self, pid: Any) -> Any:
+        return pid
+
+
+def _torch_storage(data: bytes) -> np.ndarray:
+    return read_torch_storage(io.BytesIO(data), lambda file: _StorageUnpickler(file).load())
+
+
 def _plain(value: Any) -> Any:
     """Containers with chumpy's wrappers replaced by the arrays inside."""
     if isinstance(value, _ChumpyArray):
         return value.array()
+    if isinstance(value, JoblibArray):
+        return _plain(value.array)
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -100,19 +145,19 @@ def _unpickle(file: BinaryIO) -> Any:
     with warnings.catch_warnings():
         # Every array that an older NumPy pickled carries its flag as a number: no news to a user.
         warnings.filterwarnings("ignore", message=r"dtype\(\): align should be passed")
-        # latin1 reads the byte strings of arrays that Python 2 pickled.
-        return _plain(_RestrictedUnpickler(file, encoding="latin1").load())
+        return _plain(_RestrictedUnpickler(file).load())
 
 
 def load_pickle(path: str | os.PathLike[str]) -> Any:
-    """Read a pickle of plain data; chumpy arrays come back as NumPy arrays.
+    """Read a pickle of plain data; arrays of chumpy, joblib and PyTorch come back as NumPy arrays.
+
+    Files that joblib compressed (zlib, gzip, bz2, lzma, xz) are read as well.
 
     **Raises:** `UnsafePickleError` if the file asks for anything but data, `ValueError` naming the
     file if it is damaged, `FileNotFoundError`.
     """
     try:
-        with open(path, "rb") as file:
-            return _unpickle(file)
+        return _unpickle(io.BytesIO(decompress(Path(path).read_bytes())))
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{os.fspath(path)}: {error}") from None
     except OSError:

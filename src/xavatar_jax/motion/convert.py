@@ -18,11 +18,15 @@ if TYPE_CHECKING:
 
 
 class MotionNotice(UserWarning):
-    """Something of a motion was cut, filled or left out to fit a body."""
+    """Something of a motion was assumed, filled in, cut or left out."""
 
 
 def fit_size(
-    values: Float[np.ndarray, "*batch n"], limit: int, name: str, source: str
+    values: Float[np.ndarray, "*batch n"],
+    limit: int,
+    name: str,
+    source: str,
+    holder: str = "the body",
 ) -> tuple[Float[np.ndarray, "*batch m"], str | None]:
     """Cut the last axis to `limit`, or fill it with zeros to ten as far as `limit` allows.
 
@@ -35,9 +39,19 @@ def fit_size(
     notice = None
     if np.any(values[..., limit:] != 0):
         notice = (
-            f"{source}: {found} {name} given, the body has {limit}; the last {found - limit} cut."
+            f"{source}: {found} {name} given, {holder} has {limit}; the last {found - limit} cut."
         )
     return values[..., :limit], notice
+
+
+def shape_for(motion: Motion, body: BodyModel) -> tuple[Float[np.ndarray, " S"], str | None]:
+    """The motion's shape coefficients if they are of the body's model, else none and a notice."""
+    if motion.model in ("unknown", body.kind) or not motion.betas.any():
+        return motion.betas, None
+    return np.zeros(0), (
+        f"{motion.source}: betas are of {motion.model} and mean nothing to the {body.kind} body; "
+        "its mean shape is used."
+    )
 
 
 def to_params(motion: Motion, body: BodyModel) -> BodyParams:
@@ -84,11 +98,12 @@ def fit_to_body(motion: Motion, body: BodyModel) -> tuple[BodyParams, list[str]]
             f"{motion.source}: {len(dropped)} moving joints are not in the body "
             f"({', '.join(dropped[:4])}{', ...' if len(dropped) > 4 else ''}); they are left out."
         )
-    betas, betas_notice = fit_size(motion.betas, body.num_betas, "betas", motion.source)
+    betas, model_notice = shape_for(motion, body)
+    betas, betas_notice = fit_size(betas, body.num_betas, "betas", motion.source)
     expression, expression_notice = fit_size(
         np.asarray(motion.expression), body.num_expression, "expression coefficients", motion.source
     )
-    notices += [n for n in (betas_notice, expression_notice) if n]
+    notices += [n for n in (model_notice, betas_notice, expression_notice) if n]
     params = BodyParams(
         pose=jnp.asarray(pose, float),
         betas=jnp.asarray(np.broadcast_to(betas, (len(motion), len(betas))), float),

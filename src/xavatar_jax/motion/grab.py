@@ -7,26 +7,23 @@ takes the place of shape coefficients.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from ..body import SMPLX_TREE
-from .record import Motion, UpAxis
+from .format import Format, ReadOptions, Source
+from .record import Motion
+from .values import text
 
 
-def is_grab(data: dict[str, Any]) -> bool:
-    """Whether an archive's entries are those of GRAB."""
-    return isinstance(data.get("body"), dict) and "params" in data["body"]
+def _recognise(source: Source) -> bool:
+    if source.kind not in ("npz", "pickle") or "body" not in source.keys:
+        return False
+    body = source.data["body"]
+    return isinstance(body, dict) and isinstance(body.get("params"), dict)
 
 
-def read_grab(data: dict[str, Any], path: Path, *, fps: float | None, up: UpAxis) -> Motion:
-    """The motion in the entries of a GRAB archive.
-
-    Raises:
-        ValueError: an entry is missing or misshapen.
-    """
+def _read(source: Source, options: ReadOptions) -> Motion:
+    data, path, fps = source.data, source.path, options.fps
     params = data["body"]["params"]
     for key in ("fullpose", "transl"):
         if key not in params:
@@ -45,14 +42,18 @@ def read_grab(data: dict[str, Any], path: Path, *, fps: float | None, up: UpAxis
         joint_names=SMPLX_TREE.names,
         fps=float(np.asarray(data["framerate"]).reshape(-1)[0]) if fps is None else fps,
         expression=np.asarray(params["expression"]) if "expression" in params else None,
-        up=up,
+        up=options.up or "z",
         gender=text(data["gender"]).lower() if "gender" in data else "unknown",
         source=str(path),
         template=None if template is None else text(template),
+        model="smplx",
     )
 
 
-def text(value: Any) -> str:
-    """A word stored as a string, as bytes, or as an array of either."""
-    item = np.asarray(value).reshape(-1)[0]
-    return (item.decode() if isinstance(item, bytes) else str(item)).strip()
+FORMAT = Format(
+    name="grab",
+    title="GRAB sequence",
+    sought="an .npz with body.params of fullpose and transl",
+    recognise=_recognise,
+    read=_read,
+)

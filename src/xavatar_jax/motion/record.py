@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
-from . import convert, resampling, rotate
+from . import convert, editing, resampling, rotate, smoothing
 
 if TYPE_CHECKING:
     from ..body import BodyModel, BodyParams
@@ -34,6 +35,8 @@ class Motion:
         source: where the motion comes from, for messages.
         notices: what was assumed or changed on the way from the source.
         template: mesh file of the person's own template, as the source names it.
+        model: the body model whose joints and shape coefficients these are ("smplx", "smplh",
+            "smpl"), or "unknown". Shape coefficients mean nothing to another model.
 
     Raises:
         ValueError: shapes do not match, a value is not finite, no frames, or a frame rate that
@@ -51,6 +54,7 @@ class Motion:
     source: str = "motion"
     notices: tuple[str, ...] = ()
     template: str | None = None
+    model: str = "unknown"
 
     def __post_init__(self):
         count = len(self.poses)
@@ -141,6 +145,14 @@ class Motion:
         """The motion at another frame rate. See `resampling.resample`."""
         return resampling.resample(self, fps)
 
+    def smooth(self, seconds: float, joints: Sequence[str] | None = None) -> Motion:
+        """The motion without jitter faster than about `seconds`. See `smoothing.smooth`."""
+        return smoothing.smooth(self, seconds, joints)
+
+    def trim(self, start: float = 0.0, end: float | None = None) -> Motion:
+        """The frames between two times, in seconds. See `editing.trim`."""
+        return editing.trim(self, start, end)
+
 
 def _check(motion: Motion) -> None:
     count, joints = len(motion.poses), len(motion.joint_names)
@@ -166,10 +178,15 @@ def _check(motion: Motion) -> None:
             if values.ndim > 1:
                 bad = ~np.isfinite(values.reshape(count, -1)).all(axis=1)
                 where = f" in {int(bad.sum())} frames, first in frame {int(np.argmax(bad))}"
-            raise ValueError(f"{motion.source}: {name} is not finite{where}.")
+            raise ValueError(
+                f"{motion.source}: {name} is not finite{where}: cut or mend those frames."
+            )
     if count == 0:
         raise ValueError(f"{motion.source}: the motion has no frames.")
     if not (np.isfinite(motion.fps) and motion.fps > 0):
-        raise ValueError(f"{motion.source}: frame rate {motion.fps}; it must be positive.")
+        raise ValueError(
+            f"{motion.source}: frame rate {motion.fps}; it must be positive. Give the right one "
+            "with fps=."
+        )
     if motion.up not in get_args(UpAxis):
         raise ValueError(f"{motion.source}: up axis {motion.up!r}; it must be 'y' or 'z'.")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..body import rest_joints
+from .convert import shape_for
 
 if TYPE_CHECKING:
     from ..body import BodyModel
@@ -31,6 +32,11 @@ def rest_pelvis(body: BodyModel, betas: Float[np.ndarray, " S"]) -> Float[np.nda
     """
     fitted = jnp.asarray(betas[: body.num_betas], float)
     return np.asarray(rest_joints(body, fitted)[0], np.float64)
+
+
+def pelvis_of(motion: Motion, body: BodyModel) -> Float[np.ndarray, 3]:
+    """`rest_pelvis` of the body in the motion's shape, the mean one if that is of another model."""
+    return rest_pelvis(body, shape_for(motion, body)[0])
 
 
 def rotate_world(
@@ -78,4 +84,25 @@ def to_up(motion: Motion, body: BodyModel, up: UpAxis) -> Motion:
     """
     if motion.up == up:
         return motion
-    return rotate_world(motion, _TO_UP[up], rest_pelvis(body, motion.betas), up=up)
+    return rotate_world(motion, _TO_UP[up], pelvis_of(motion, body), up=up)
+
+
+def from_camera(motion: Motion, body: BodyModel | None) -> Motion:
+    """The motion in a y-up world, of one in OpenCV camera axes (x right, y down, z forward).
+
+    Where no body is given the world turns about a pelvis at the origin, which moves the whole
+    motion by a constant; the notice says so. A motion without translation keeps none.
+
+    Args:
+        motion: in camera axes.
+        body: gives the pelvis to turn about.
+    """
+    turn = np.diag([1.0, -1.0, -1.0])
+    if not motion.transl.any():
+        return replace(rotate_world(motion, turn, np.zeros(3), up="y"), transl=motion.transl)
+    if body is not None:
+        return rotate_world(motion, turn, pelvis_of(motion, body), up="y")
+    return rotate_world(motion, turn, np.zeros(3), up="y").with_notice(
+        f"{motion.source}: turned y-up without a body, so the place of the whole motion is off by "
+        "a constant of a few decimetres; pass body= for the exact one."
+    )

@@ -1,0 +1,327 @@
+"""BVH against forward kinematics written here, on our skeleton and on those of others."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import writers
+from helpers import reference_world
+from scipy.spatial.transform import Rotation
+
+from xavatar_jax.body import SMPLX_TREE, rest_joints
+from xavatar_jax.motion import (
+    JOINT_MAPS,
+    Motion,
+    MotionNotice,
+    load_motion,
+    save_bvh,
+    save_motion,
+)
+from xavatar_jax.motion.bvh_joints import NEEDED
+
+ROOT = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
+TURNS = ROOT[3:]
+LIMBS = [
+    (f"{side}_{a}", f"{side}_{b}")
+    for side in ("left", "right")
+    for a, b in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+]
+
+
+def quiet(function, *args, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MotionNotice)
+        return function(*args, **options)
+
+
+def body_joints(body, motion):
+    """Joints over time, one after another by the tree: turned about the pelvis, then moved."""
+    params = quiet(motion.to_params, body)
+    rest = np.asarray(rest_joints(body, params.betas[0]), np.float64)
+    rotations = [Rotation.from_rotvec(pose).as_matrix() for pose in np.asarray(params.pose)]
+    world = [reference_world(body.tree.parents, turns, rest)[:, :3, 3] for turns in rotations]
+    return np.stack(world) + np.asarray(params.transl)[:, None]
+
+
+def some_motion(body, count=4, seed=0, **changes):
+    rng = np.random.default_rng(seed)
+    fields = {
+        "poses": 0.4 * rng.normal(size=(count, body.num_joints, 3)),
+        "transl": rng.normal(size=(count, 3)),
+        "joint_names": body.tree.names,
+        "fps": 30.0,
+    }
+    return Motion(**{**fields, **changes})
+
+
+def turn(axis: str, degrees: float) -> np.ndarray:
+    """A turn about one axis, written out."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rows = {
+        "X": [[1, 0, 0], [0, c, -s], [0, s, c]],
+        "Y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+        "Z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+    }
+    return np.array(rows[axis])
+
+
+def places(text: str) -> tuple[dict[str, np.ndarray], float]:
+    """World places of all joints over time, `(T, 3)` by name, and seconds a frame."""
+    head, motion = text.split("MOTION\n")
+    names, offsets, parents, channels, stack = [], [], [], [], []
+    for line in head.splitlines()[1:]:
+        word, *rest = line.split()
+        if word in ("ROOT", "JOINT", "End"):
+            parents.append(stack[-1] if stack else -1)
+            names.append(rest[0] if word != "End" else f"end of {names[stack[-1]]}")
+            channels.append([])
+            stack.append(len(names) - 1)
+        elif word == "}":
+            stack.pop()
+        elif word == "OFFSET":
+            offsets.append([float(x) for x in rest])
+        elif word == "CHANNELS":
+            channels[-1] = rest[1:]
+    lines = motion.splitlines()
+    result = {name: [] for name in names}
+    for row in lines[2:]:
+        values = iter(map(float, row.split()))
+        world = []
+        for parent, offset, names_here in zip(parents, offsets, channels, strict=True):
+            local, place = np.eye(3), np.array(offset, float)
+            for channel in names_here:
+                value = next(values)
+                if channel.endswith("position"):
+                    place["XYZ".index(channel[0])] = value
+                else:
+                    local = local @ turn(channel[0], value)
+            above, start = world[parent] if parent >= 0 else (np.eye(3), np.zeros(3))
+            world.append((above @ local, start + above @ place))
+        for name, (_, place) in zip(names, world, strict=True):
+            result[name].append(place)
+    return {n: np.array(p) for n, p in result.items()}, float(lines[1].split(":")[1])
+
+
+def test_written_joints_stand_where_the_body_has_them(tmp_path, toy_body):
+    betas = np.linspace(-1, 1, 10)
+    motion = some_motion(toy_body, betas=betas)
+    with pytest.warns(MotionNotice, match="not in the BVH file: betas"):
+        path = save_motion(tmp_path / "a.bvh", motion, body=toy_body)
+    found, interval = places(path.read_text())
+    assert interval == pytest.approx(1 / 30, abs=1e-12)
+    expected = body_joints(toy_body, motion)
+    for joint, name in enumerate(toy_body.tree.names):
+        np.testing.assert_allclose(found[name], expected[:, joint], atol=1e-5, err_msg=name)
+
+
+def test_reading_what_was_written(tmp_path, toy_body):
+    motion = some_motion(toy_body, count=6, up="z")
+    back = load_motion(save_bvh(tmp_path / "a.bvh", motion, toy_body), body=toy_body)
+    expected = motion.to_y_up(toy_body)
+    assert (back.up, back.fps, back.notices) == ("y", 30.0, ())
+    np.testing.assert_allclose(back.transl, expected.transl, atol=1e-7)
+    np.testing.assert_allclose(back.poses, expected.poses, atol=1e-7)
+    for name in ("poses", "transl"):
+        one, other = (np.float32(getattr(m, name)) for m in (back, expected))
+        # The same float32 numbers, but for the few that lie on the edge between two.
+        assert (one != other).mean() < 0.01
+
+
+def test_rotations_of_another_shape_come_back(tmp_path, bundled_body):
+    betas = 2 * np.random.default_rng(0).normal(size=10)
+    motion = some_motion(bundled_body, betas=betas)
+    path = quiet(save_bvh, tmp_path / "a.bvh", motion, bundled_body)
+    back = load_motion(path, body=bundled_body)
+    np.testing.assert_allclose(back.poses, motion.poses, atol=1e-7)
+    # The shape is lost; the pelvis stays where it was.
+    pelvis = body_joints(bundled_body, back)[:, 0]
+    np.testing.assert_allclose(pelvis, body_joints(bundled_body, motion)[:, 0], atol=1e-5)
+
+
+def test_right_angles_are_written(tmp_path, toy_body):
+    poses = np.zeros((2, 55, 3))
+    poses[:, 5] = [np.pi / 2, 0, 0]
+    motion = some_motion(toy_body, poses=poses, transl=np.zeros((2, 3)))
+    back = load_motion(save_bvh(tmp_path / "a.bvh", motion, toy_body), body=toy_body)
+    np.testing.assert_allclose(back.poses, poses, atol=1e-7)
+
+
+def mixamo(arms=(60.0, -40.0, 0.0), prefix="mixamorig:"):
+    """A skeleton in centimetres whose arms hang, with names and order of another program."""
+    legs = ("UpLeg", (9.0, -6.0, 0.5)), ("Leg", (1.0, -42.0, 1.0)), ("Foot", (0.5, -41.0, -2.0))
+    arm = (
+        ("Shoulder", (6.0, 10.0, 0.0)), ("Arm", (12.0, 0.0, 0.0)),
+        ("ForeArm", tuple(0.4 * a for a in arms)), ("Hand", tuple(0.38 * a for a in arms)),
+        ("HandIndex1", (9.0, -3.0, 1.0)),
+    )  # fmt: skip
+    listed = [(0, "Hips", (0.0, 0.0, 0.0), ROOT), (1, "Spine", (0.0, 10.0, -1.0), TURNS)]
+    listed += [(2, "Spine1", (0.0, 11.0, 0.0), TURNS), (3, "Spine2", (0.0, 12.0, 0.0), TURNS)]
+    listed += [(4, "Neck", (0.0, 15.0, 1.0), TURNS), (5, "Head", (0.0, 9.0, 2.0), TURNS)]
+    listed += [(6, "HeadTop_End", (0.0, 18.0, 0.0), TURNS), (7, "", (0.0, 1.0, 0.0), None)]
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        for chain, depth in ((arm, 4), (legs, 1)):
+            for k, (name, (x, y, z)) in enumerate(chain):
+                listed.append((depth + k, side + name, (sign * x, y, z), TURNS))
+            listed.append((depth + len(chain), "", (0.0, -5.0, 0.0), None))
+    joints = [(d, f"{prefix}{n}" if n else n, o, c) for d, n, o, c in listed]
+    return joints, 6 + 3 * (sum(c is not None for *_, c in joints) - 1)
+
+
+NAMES = {
+    "pelvis": "Hips", "head": "Head", "neck": "Neck", "left_shoulder": "LeftArm",
+    "left_elbow": "LeftForeArm", "left_wrist": "LeftHand", "left_hip": "LeftUpLeg",
+    "left_knee": "LeftLeg", "left_ankle": "LeftFoot", "left_index1": "LeftHandIndex1",
+}  # fmt: skip
+NAMES |= {n.replace("left", "right"): v.replace("Left", "Right") for n, v in NAMES.items()}
+
+
+def directions(place, pairs):
+    bones = np.stack([place(far) - place(near) for near, far in pairs])
+    return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("prefix", ["mixamorig:", "", "mixamorig_"])
+def test_limbs_point_where_those_of_another_skeleton_do(tmp_path, toy_body, prefix):
+    joints, width = mixamo(prefix=prefix)
+    rows = np.random.default_rng(0).uniform(-40, 40, (5, width))
+    text = writers.bvh(joints, rows, interval=1 / 60)
+    (tmp_path / "a.bvh").write_text(text)
+    with pytest.warns(MotionNotice) as caught:
+        motion = load_motion(tmp_path / "a.bvh", body=toy_body)
+    said = " ".join(str(w.message) for w in caught)
+    assert "joint map 'mixamo'" in said
+    assert "HeadTop_End" in said
+    assert "limbs at rest point up to" in said
+    assert "fit the legs of the body" in said
+    assert motion.fps == 60.0
+    found, _ = places(text)
+    posed, names = body_joints(toy_body, motion), toy_body.tree.names
+    one = directions(lambda n: posed[:, names.index(n)], LIMBS)
+    other = directions(lambda n: found[prefix + NAMES[n]], LIMBS)
+    np.testing.assert_allclose(one, other, atol=1e-5)
+    # The pelvis moves with the length of the legs, so that feet stay on the ground.
+    rest = body_joints(toy_body, some_motion(toy_body, poses=np.zeros((4, 55, 3))))[0]
+    own = sum(np.linalg.norm(rest[names.index(b)] - rest[names.index(a)]) for a, b in LIMBS[2:4])
+    theirs = np.linalg.norm((1, -42, 1)) + np.linalg.norm((0.5, -41, -2))
+    pelvis = posed[:, 0]
+    np.testing.assert_allclose(pelvis, found[f"{prefix}Hips"] * own / theirs, rtol=0.01, atol=1e-3)
+
+
+def test_a_skeleton_at_rest_gives_its_own_rest_pose(tmp_path, toy_body):
+    joints, width = mixamo(arms=(60.0, -60.0, 0.0))
+    (tmp_path / "a.bvh").write_text(writers.bvh(joints, np.zeros((2, width))))
+    motion = quiet(load_motion, tmp_path / "a.bvh", body=toy_body)
+    posed, names = body_joints(toy_body, motion), toy_body.tree.names
+    arm = directions(lambda n: posed[:, names.index(n)], [("left_shoulder", "left_elbow")])[0]
+    np.testing.assert_allclose(arm, np.tile(np.array([1, -1, 0]) / np.sqrt(2), (2, 1)), atol=1e-5)
+    # Hands go on straight from the forearm, feet stay flat.
+    np.testing.assert_allclose(motion.joint("left_wrist"), 0, atol=1e-7)
+    leg = Rotation.from_rotvec(motion.joint("left_hip")) * Rotation.from_rotvec(
+        motion.joint("left_knee")
+    )
+    foot = leg * Rotation.from_rotvec(motion.joint("left_ankle"))
+    assert foot.magnitude().max() < 1e-6
+
+
+def test_skeletons_with_z_up_are_turned(tmp_path, toy_body):
+    joints, width = mixamo()
+    rows = np.random.default_rng(1).uniform(-40, 40, (3, width))
+    (tmp_path / "y.bvh").write_text(writers.bvh(joints, rows))
+    upright = quiet(load_motion, tmp_path / "y.bvh", body=toy_body)
+    # The same file by a program with z up, facing -y: (x, y, z) there is (x, -z, y).
+    swap = {"X": ("X", 1), "Y": ("Z", 1), "Z": ("Y", -1)}
+    turned, columns = [], []
+    for depth, name, (x, y, z), channels in joints:
+        names = None
+        if channels is not None:
+            columns += [swap[c[0]][1] for c in channels]
+            names = tuple(swap[c[0]][0] + c[1:] for c in channels)
+        turned.append((depth, name, (x, -z, y), names))
+    (tmp_path / "z.bvh").write_text(writers.bvh(turned, rows * np.array(columns)))
+    with pytest.warns(MotionNotice) as caught:
+        motion = load_motion(tmp_path / "z.bvh", body=toy_body)
+    assert any("not y-up facing +z; it was turned" in str(w.message) for w in caught)
+    np.testing.assert_allclose(motion.poses, upright.poses, atol=1e-7)
+    np.testing.assert_allclose(motion.transl, upright.transl, atol=1e-7)
+
+
+def test_joint_maps_are_taken_and_checked(tmp_path, toy_body):
+    joints, width = mixamo(prefix="")
+    odd = [(d, f"b_{n}" if n else n, o, c) for d, n, o, c in joints]
+    path = tmp_path / "a.bvh"
+    path.write_text(writers.bvh(odd, np.zeros((2, width))))
+    with pytest.raises(ValueError, match=r"no joint for pelvis, head.*b_Hips.*joint_map=") as error:
+        load_motion(path, body=toy_body)
+    assert "a.bvh" in str(error.value)
+    chosen = {f"b_{theirs}": ours for ours, theirs in NAMES.items()}
+    motion = quiet(load_motion, path, body=toy_body, joint_map=chosen)
+    assert len(motion) == 2
+    for bad, message in (
+        (chosen | {"b_Tail": "head"}, "joint_map names b_Tail"),
+        (chosen | {"b_Neck": "throat"}, "leads to throat"),
+        ("daz", "No joint map 'daz'; there are smplx, mixamo, cmu, smpl"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load_motion(path, body=toy_body, joint_map=bad)
+    quiet(load_motion, path, body=toy_body, joint_map=chosen, scale=0.01)
+
+
+def test_scale_and_frame_rate_can_be_said(tmp_path, toy_body):
+    joints, width = mixamo()
+    rows = np.zeros((2, width))
+    rows[:, 1] = 95.0
+    (tmp_path / "a.bvh").write_text(writers.bvh(joints, rows))
+    motion = quiet(load_motion, tmp_path / "a.bvh", body=toy_body, scale=0.01, fps=24)
+    assert motion.fps == 24
+    assert body_joints(toy_body, motion)[0, 0, 1] == pytest.approx(0.95, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.replace("MOTION", "MOTIONS"), "line .*is no BVH"),
+        (lambda t: t.split("MOTION")[0], "not closed before MOTION"),
+        (lambda t: t.replace("Frames: 2", "Frames: 3"), "Frames: 3, but 2 rows"),
+        (lambda t: t.replace("Frame Time: 0.033333", "Frame Time: -0.1"), "Frame Time: -0.1"),
+        (lambda t: t.replace("Frame Time: 0.033333", "Time: 1"), "expected 'Frame Time:'"),
+        (lambda t: t.replace("CHANNELS 3", "CHANNELS 2", 1), "CHANNELS 2 Zrotation"),
+        (lambda t: t.replace("Xrotation", "Wrotation", 1), "is not understood"),
+        (lambda t: t[: t.rindex(" ")], "numbers, but the joints have"),
+        (lambda t: t[: t.rindex(" ")] + " nan", "not finite in 1 of 2 frames"),
+        (lambda t: t[: t.rindex(" ")] + " x", "expected a number"),
+        (lambda t: t.replace("OFFSET 0.0 0.0 0.0", "OFFSET 0.0 up 0.0"), "expected a number"),
+        (lambda t: t.replace("LeftLeg", "RightLeg"), "stands where none can"),
+        (lambda t: t.replace("Frames: 2", "Frames: 0").split("0.033333")[0] + "0.1", "no frames"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, toy_body, change, message):
+    joints, width = mixamo()
+    (tmp_path / "a.bvh").write_text(change(writers.bvh(joints, np.zeros((2, width)))))
+    with pytest.raises(ValueError, match=message) as error:
+        load_motion(tmp_path / "a.bvh", body=toy_body)
+    assert "a.bvh" in str(error.value)
+
+
+def test_bvh_needs_a_body_with_those_joints(tmp_path, toy_body, family):
+    joints, width = mixamo()
+    (tmp_path / "a.bvh").write_text(writers.bvh(joints, np.zeros((2, width))))
+    with pytest.raises(ValueError, match=r"Pass body=.*the body that is to move"):
+        load_motion(tmp_path / "a.bvh")
+    with pytest.raises(ValueError, match=r"the body \(mano.* has no pelvis, head"):
+        load_motion(tmp_path / "a.bvh", body=family["mano"])
+    odd = Motion(poses=np.zeros((1, 1, 3)), transl=np.zeros((1, 3)), joint_names=("x",), fps=1)
+    with pytest.raises(ValueError, match="no joint of the motion is a joint of the body"):
+        save_bvh(tmp_path / "b.bvh", odd, toy_body)
+
+
+@pytest.mark.parametrize("name", JOINT_MAPS)
+def test_every_map_leads_to_what_is_needed(name):
+    targets = list(JOINT_MAPS[name].values())
+    assert set(NEEDED) <= set(targets) <= set(SMPLX_TREE.names)
+    assert len(set(targets)) == len(targets)
+    for theirs, ours in JOINT_MAPS[name].items():
+        side = {"l": "left", "r": "right"}.get(theirs[0].lower())
+        if ours.startswith(("left", "right")):
+            assert ours.startswith(str(side)), (theirs, ours)
