@@ -12,8 +12,8 @@ import xavatar_jax
 SOURCE = Path(xavatar_jax.__file__).parent
 LAYERS = (
     *("files", "geometry", "kinematics", "body", "frames", "fields", "correspondence"),
-    *("sampling", "losses", "training", "meshing", "metrics", "avatar", "motion", "datasets"),
-    *("export", "render", "report"),
+    *("sampling", "losses", "training", "meshing", "export", "metrics", "avatar", "motion"),
+    *("datasets", "render", "report"),
 )
 # Not packages of the library's stages: they may import everything.
 OUTSIDE = {"__init__", "__main__", "cli", "_version"}

@@ -3,6 +3,7 @@
     python docs/figures/update.py                                    # write the tables again
     python docs/figures/update.py --metrics out/fit_grab/metrics.json
     python docs/figures/update.py --part-aware part_aware.json
+    python docs/figures/update.py --animate animate.json
 
 A result is copied into this folder without what is of no use elsewhere (paths, single frames).
 A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`; the table
@@ -21,8 +22,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "figures"
-TEXTS = ("README.md", "docs/benchmarks.md", "docs/options.md")
+TEXTS = ("README.md", "docs/benchmarks.md", "docs/options.md", "docs/animate-and-export.md")
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
+ANIMATE = "animate.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
 
@@ -79,6 +81,23 @@ _SEARCH = (
     ("equal_time_steps", "equal time: steps", 0),
     ("equal_time_cd_all_mm", "equal time: Chamfer, all, mm", 2),
     ("equal_time_cd_hands_mm", "equal time: Chamfer, hands, mm", 2),
+)
+_ANIMATE = (
+    ("frames_per_s", "frames/s", 1),
+    ("processor_ms_per_frame", "processor time a frame, ms", 1),
+    ("vertex_mean_mm", "from vertex to vertex, mean, mm", 3),
+    ("vertex_p99_mm", "the same, 99th percentile", 2),
+    ("surface_mean_mm", "from vertex to surface, mean, mm", 3),
+    ("surface_p99_mm", "the same, 99th percentile", 2),
+    ("surface_max_mm", "the same, maximum", 1),
+)
+_EXPORT = (
+    ("seconds", "time, s", 1),
+    ("megabytes", "size, MB", 1),
+    ("influences_mean_mm", "lost by bones left out, mean, mm", 3),
+    ("influences_max_mm", "the same, maximum", 2),
+    ("rig_mean_mm", "lost in all, mean, mm", 3),
+    ("rig_max_mm", "the same, maximum", 1),
 )
 
 
@@ -151,6 +170,30 @@ def benchmark_view(record: dict[str, Any]) -> str:
     )
 
 
+def animate_view(record: dict[str, Any]) -> str:
+    """One column a way of following pose and expression."""
+    columns, header = record["rows"], record["header"]
+    rows = [["`offsets`", *(f"`{column['offsets']}`" for column in columns)]]
+    for name, label, digits in _ANIMATE:
+        values = (_number(column.get(name), digits) for column in columns)
+        rows.append([label, *(value if value != "not measured" else "-" for value in values)])
+    return (
+        f"{_table(rows)}\n\n{_sentence(_machine(header))}; preset `{header['preset']}`, "
+        f"{header['vertices']} vertices, {header['frames']} frames; extraction of the neutral "
+        f"surface {header['extraction_s']:.1f} s and what is kept of it {header['base_s']:.1f} s, "
+        f"once an avatar."
+    )
+
+
+def export_view(record: dict[str, Any]) -> str:
+    """One column a number of influences."""
+    exports, header = record["header"]["exports"], record["header"]
+    rows = [["influences a vertex", *(str(export["influences"]) for export in exports)]]
+    for name, label, digits in _EXPORT:
+        rows.append([label, *(_number(export[name], digits) for export in exports)])
+    return f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['frames']} frames."
+
+
 def presets_view() -> str:
     """Entries of the two presets, side by side."""
     import xavatar_jax as xa
@@ -167,6 +210,8 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{METRICS} stages": stages_view,
     f"docs/figures/{METRICS} distance": distance_view,
     f"docs/figures/{PART_AWARE}": benchmark_view,
+    f"docs/figures/{ANIMATE}": animate_view,
+    f"docs/figures/{ANIMATE} export": export_view,
 }
 _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
@@ -221,11 +266,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
     parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
+    parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
     args = parser.parse_args()
     if args.metrics:
         _store(args.metrics, METRICS, slim_metrics)
     if args.part_aware:
         _store(args.part_aware, PART_AWARE, slim_benchmark)
+    if args.animate:
+        _store(args.animate, ANIMATE, slim_benchmark)
     for name in TEXTS:
         path = ROOT / name
         path.write_text(filled(path.read_text("utf-8")), encoding="utf-8")

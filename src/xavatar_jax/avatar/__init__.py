@@ -1,5 +1,7 @@
 """Avatars: fit, query, pose, evaluate, save and load."""
 
+from .animate import Animation as Animation
+from .animate import AnimationError as AnimationError
 from .avatar import Avatar as Avatar
 from .avatar import CellSizes as CellSizes
 from .evaluate import Evaluation as Evaluation
@@ -7,4 +9,5 @@ from .evaluate import evaluate as evaluate
 from .fit import Fit as Fit
 from .fit import fit as fit
 from .query import Query as Query
+from .rigging import GlbExport as GlbExport
 from .store import load_avatar as load_avatar

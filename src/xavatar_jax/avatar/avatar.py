@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from ..body import (
     BODY,
@@ -28,13 +28,14 @@ from ..body import (
 from ..correspondence import RowFinder, StartSet
 from ..fields import TabulatedSkinning
 from ..geometry import nearest_vertices
-from ..kinematics import skin_points
 from ..meshing import Mesh, extract_surface
 from ..training import AvatarFields, FitConfig
 from ..training.pool import tabulate_for_search
+from .animate import Animation, MotionLike, Offsets, PosableBase, animate, posable_base
+from .pointwise import batch_size, gradients, in_batches, logits, project, skin, skin_weights
 from .query import Query, query_posed
+from .rigging import GlbExport, Motions, export_glb, export_weights
 
-_BATCH = 16_384
 MAX_VERTICES = 50_000
 
 
@@ -68,7 +69,7 @@ class Avatar:
 
     def skin_weights(self, points: Float[Array, "N 3"]) -> Float[Array, "N J"]:
         """Learned skinning weights at canonical points, metres."""
-        return _skin_weights(self.fields, jnp.asarray(points))
+        return skin_weights(self.fields, jnp.asarray(points))
 
     def query(
         self, points: Float[Array, "N 3"], params: BodyParams, *, starts: StartSet = "part_aware"
@@ -123,10 +124,10 @@ class Avatar:
             return base
         check_params(self.body, params)
         condition = self.fields.geometry.condition(self._own(params))
-        vertices = _in_batches(
-            lambda x: _project(self.fields, x, condition), base.vertices, self._batch
+        vertices = in_batches(
+            lambda x: project(self.fields, x, condition), base.vertices, batch_size(self.config)
         )
-        return Mesh(vertices, base.faces)
+        return replace(base, vertices=vertices, normals=None)
 
     def mesh(
         self,
@@ -148,13 +149,82 @@ class Avatar:
         if mode == "fast":
             canonical = self.canonical_mesh(params, cell=cell, max_vertices=max_vertices)
             transforms = bone_transforms(self.body, self._own(params))
-            vertices = _in_batches(
-                lambda x: _pose(self.fields, x, transforms), canonical.vertices, self._batch
+            vertices = in_batches(
+                lambda x: skin(self.fields, x, transforms),
+                canonical.vertices,
+                batch_size(self.config),
             )
-            return Mesh(vertices, canonical.faces)
+            return replace(canonical, vertices=vertices)
         if mode == "full":
             return self._extract_posed(params, cell, max_vertices)
         raise ValueError(f"unknown mode {mode!r}: fast or full")
+
+    def animate(
+        self,
+        motion: MotionLike | BodyParams,
+        *,
+        mode: Literal["fast", "full"] = "fast",
+        offsets: Offsets = "cached",
+        fps: float | None = None,
+    ) -> Animation:
+        """The posed surface over a motion, or over parameters `(T, ...)`; nothing is computed yet.
+
+        `fast` moves and skins one base mesh, so all frames share their faces. How its vertices
+        follow pose and expression is `offsets`: `cached` takes one step along the base's normals,
+        from the logits of the frame at the base, in milliseconds; `exact` is `mesh` frame by
+        frame; `none` skins the neutral surface. `Animation.error` measures the difference.
+        `full` extracts the posed field of each frame: see `mesh`.
+
+        The motion's world is kept (`Motion.to_y_up` turns it), its shape gives way to the
+        avatar's. `fps` replaces the motion's frame rate; parameters have none and get 30.
+
+        **Raises:** `ValueError` for parameters that do not fit the body or are not finite, or a
+        frame rate that is not positive; `TypeError` for something else than a motion.
+        """
+        return animate(self, motion, mode=mode, offsets=offsets, fps=fps)
+
+    def export_glb(
+        self,
+        path: str | os.PathLike[str],
+        motion: Motions | None = None,
+        *,
+        influences: Literal[4, 8] = 4,
+        expressions: bool = True,
+        colors: UInt8[np.ndarray, "V C"] | None = None,
+        up: Literal["y", "z"] | None = None,
+        verbose: bool = True,
+    ) -> GlbExport:
+        """Write a rigged `.glb`: mesh, skeleton, weights, expressions as blend shapes, clips.
+
+        `motion` is one motion, parameters `(T, ...)` at 30 frames a second, or several by the
+        names that their clips get. The file is in metres with y up, whatever the motions' own up
+        axis (`up` for parameters, else y). Eight `influences` lose less than four; Blender reads
+        them, three.js takes the first four. `colors` are sRGB, one row a vertex of
+        `canonical_mesh()`, in place of the mesh's own.
+
+        What the file loses against `animate` is measured on 24 frames, returned, and printed
+        unless `verbose` is false. The file appears whole or not at all.
+
+        **Raises:** `ValueError` for a name that does not end in `.glb`, or as for `animate`;
+        `OSError` if the file cannot be written.
+        """
+        return export_glb(
+            self,
+            path,
+            motion,
+            influences=influences,
+            expressions=expressions,
+            colors=colors,
+            up=up,
+            verbose=verbose,
+        )
+
+    def export_weights(self, path: str | os.PathLike[str]) -> None:
+        """Write the neutral mesh's skinning to a plain `.npz`: see `export.write_weights`.
+
+        **Raises:** `OSError` if the file cannot be written.
+        """
+        export_weights(self, path)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the avatar to one file, without the body's arrays: see `load_avatar`."""
@@ -162,13 +232,14 @@ class Avatar:
 
         save_avatar(self, path)
 
-    @property
-    def _batch(self) -> int:
-        return _BATCH if self.config.geometry.kind == "hash" else 4096
-
     @cached_property
     def _table(self) -> TabulatedSkinning:
         return tabulate_for_search(self.body, self.betas, self.fields.skinning, self.config)
+
+    @cached_property
+    def posable(self) -> PosableBase:
+        """What `animate` keeps between frames and motions, made on first use."""
+        return posable_base(self)
 
     @cached_property
     def _base_mesh(self) -> Mesh:
@@ -193,13 +264,13 @@ class Avatar:
         condition = self.fields.geometry.condition(neutral)
 
         def field(points: np.ndarray) -> np.ndarray:
-            return np.asarray(_logits(self.fields, jnp.asarray(points), condition))
+            return np.asarray(logits(self.fields, jnp.asarray(points), condition))
 
         def gradient(points: np.ndarray) -> np.ndarray:
-            return np.asarray(_gradients(self.fields, jnp.asarray(points), condition))
+            return np.asarray(gradients(self.fields, jnp.asarray(points), condition))
 
         return self._extract(
-            field, gradient, self._canonical_vertices, cell, max_vertices, self._batch
+            field, gradient, self._canonical_vertices, cell, max_vertices, batch_size(self.config)
         )
 
     def _extract_posed(
@@ -261,51 +332,3 @@ class Avatar:
 
 
 _posed = eqx.filter_jit(lambda body, params: pose_body(body, params).vertices)
-
-
-@eqx.filter_jit
-def _skin_weights(fields: AvatarFields, points: Array) -> Array:
-    return jax.vmap(fields.skinning)(points)
-
-
-@eqx.filter_jit
-def _logits(fields: AvatarFields, points: Array, condition: Any) -> Array:
-    return jax.vmap(lambda x: fields.geometry(x, condition))(points)
-
-
-@eqx.filter_jit
-def _gradients(fields: AvatarFields, points: Array, condition: Any) -> Array:
-    return jax.vmap(jax.grad(lambda x: fields.geometry(x, condition)))(points)
-
-
-@eqx.filter_jit
-def _project(fields: AvatarFields, points: Array, condition: Any) -> Array:
-    """Move points on to the level set by Newton steps along the gradient, 3 mm a step at most."""
-
-    def value(x: Array) -> Array:
-        return fields.geometry(x, condition)
-
-    def one(x: Array) -> Array:
-        for _ in range(3):
-            f, g = jax.value_and_grad(value)(x)
-            slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
-            x = x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
-        return x
-
-    return jax.vmap(one)(points)
-
-
-@eqx.filter_jit
-def _pose(fields: AvatarFields, points: Array, transforms: Array) -> Array:
-    return jax.vmap(lambda x: skin_points(x, fields.skinning(x), transforms))(points)
-
-
-def _in_batches(function: Any, points: np.ndarray, batch: int) -> np.ndarray:
-    """Apply a jitted function to fixed-size batches, the last one padded: no retracing."""
-    count = len(points)
-    padded = np.concatenate([points, np.repeat(points[:1], -count % batch, axis=0)])
-    parts = [
-        np.asarray(function(jnp.asarray(padded[k : k + batch], jnp.float32)))
-        for k in range(0, len(padded), batch)
-    ]
-    return np.concatenate(parts)[:count]

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..body import BodyParams, pose_groups
 from ..kinematics import KinematicTree, axis_angle_to_matrix
 from .encodings import HashEncoding
+from .fixed import AbstractFixedPoints, FixedHash, FixedPoints
 from .mlp import ImplicitMLP, MLPShape
 
 
@@ -27,6 +28,10 @@ class AbstractGeometryField(eqx.Module):
     @abc.abstractmethod
     def __call__(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, ""]:
         """Logit at `x_c` (metres, canonical space) under one frame's condition."""
+
+    def at(self, points: Float[Array, "N 3"]) -> AbstractFixedPoints:
+        """The field at points that stay, for many conditions: what can be kept is kept."""
+        return FixedPoints(self, points)
 
 
 class MLPGeometry(AbstractGeometryField):
@@ -134,16 +139,32 @@ class HashGeometry(AbstractGeometryField):
         reached = self.tree.subtree(head[0]) if head else range(self.tree.num_joints)
         return rows.at[np.asarray(reached)].add(params.expression @ self.expression_weights)
 
+    def at(self, points: Float[Array, "N 3"]) -> FixedHash:
+        features = jax.vmap(self._features)(points)
+        width = self.encoding.width
+        weight, bias = self.hidden[0], self.biases[0]
+        first = jnp.matmul(features, weight[:, :width].T, precision=jax.lax.Precision.HIGHEST)
+        return FixedHash(
+            first=first + bias,
+            nearness=jax.vmap(self._nearness)(points),
+            from_condition=weight[:, width:],
+            hidden=self.hidden[1:],
+            biases=self.biases[1:],
+            sharpness=self.sharpness,
+        )
+
     def __call__(self, x_c: Float[Array, "3"], condition: Float[Array, "J K"]) -> Float[Array, ""]:
-        features = self.encoding(x_c) * self._level_mask(x_c)[:, None]
         local = self._nearness(x_c) @ condition
-        h = jnp.concatenate([features.reshape(-1), local])
+        h = jnp.concatenate([self._features(x_c), local])
         last = len(self.hidden) - 1
         for k, (weight, bias) in enumerate(zip(self.hidden, self.biases, strict=True)):
             h = weight @ h + bias
             if k < last:
                 h = jax.nn.softplus(self.sharpness * h) / self.sharpness
         return h[0]
+
+    def _features(self, x: Float[Array, "3"]) -> Float[Array, " width"]:
+        return (self.encoding(x) * self._level_mask(x)[:, None]).reshape(-1)
 
     def _nearness(self, x: Float[Array, "3"]) -> Float[Array, " J"]:
         """How much of each joint's condition is heard at `x`: a Gaussian of the distance."""

@@ -78,13 +78,13 @@ def animation(
     )
     camera = frame_view(reach, "front", forward=_facing(frames[int(chosen[0])].params))
     pictures = []
-    for k in chosen:
+    meshes = avatar.animate(frames[chosen].params)
+    for k, mesh in zip(chosen, meshes, strict=True):
         frame = frames[int(k)]
         truth = Mesh(frame.vertices, frame.faces).compute_normals()
-        mesh = avatar.mesh(frame.params).compute_normals()
         row = [
             render_mesh(truth, camera, size, base_color=_TRUTH),
-            render_mesh(mesh, camera, size, base_color=_SKIN),
+            render_mesh(mesh.compute_normals(), camera, size, base_color=_SKIN),
         ]
         pictures.append(grid_picture([row], column_labels=["ground truth", "avatar"]))
     return pictures

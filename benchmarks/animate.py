@@ -1,0 +1,132 @@
+"""Animation and rigged export of an avatar: how fast, and what is lost for it.
+
+Question: how many frames a second does `Avatar.animate` pose, how far are they from the frames' own
+meshes, and how long does a GLB file of 300 frames take?
+
+    python benchmarks/animate.py out/fit_grab/avatar.npz [--quick] [--json FILE]
+
+The avatar is one that `examples/fit_grab.py` wrote, on the bundled body; the motion is its held-out
+sequences, one after another. Each way of following pose and expression is a row; distances are
+those to `Avatar.mesh` of the same frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import xavatar_jax as xa
+from xavatar_jax.avatar import Animation, GlbExport
+from xavatar_jax.report import describe_machine, write_json
+
+OFFSETS = ("cached", "none", "exact")
+
+
+def held_out_motion(body: xa.BodyModel, frames: int) -> xa.Motion:
+    """The first `frames` frames of the bundled capture's held-out sequences, joined."""
+    parts = [part.params for part in xa.synthetic_capture(body=body).test.sequences.values()]
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:frames], *parts)
+    return xa.Motion.from_params(joined, fps=30, source="held-out sequences")
+
+
+def measure_animation(animation: Animation, timed: int, compared: int) -> dict[str, Any]:
+    """Milliseconds a frame, wall clock and processor, and distances in millimetres."""
+    animation.frame_vertices(0)  # compiles
+    wall, processor = time.perf_counter(), time.process_time()
+    for k in range(timed):
+        animation.frame_vertices(k % len(animation))
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    row = {
+        "offsets": animation.offsets,
+        "frames_per_s": timed / wall,
+        "ms_per_frame": 1000 * wall / timed,
+        "processor_ms_per_frame": 1000 * processor / timed,
+        "frames_timed": timed,
+    }
+    if animation.offsets != "exact":
+        error = animation.error(compared)
+        for name, spread in (("vertex", error.vertex), ("surface", error.surface)):
+            row |= {f"{name}_{k}_mm": v for k, v in spread._asdict().items()}
+        row["frames_compared"] = error.frames
+    return row
+
+
+def measure_export(avatar: xa.Avatar, motion: xa.Motion, influences: Any) -> dict[str, Any]:
+    """Seconds of a second export, size, and what the file loses."""
+    with tempfile.TemporaryDirectory() as folder:
+        report: GlbExport | None = None
+        seconds = 0.0
+        for _ in range(2):
+            start = time.perf_counter()
+            path = Path(folder) / "avatar.glb"
+            report = avatar.export_glb(path, motion, influences=influences, verbose=False)
+            seconds = time.perf_counter() - start
+    assert report is not None
+    assert report.influence_loss is not None
+    assert report.total_loss is not None
+    return {
+        "influences": influences,
+        "seconds": seconds,
+        "megabytes": report.num_bytes / 1e6,
+        "influences_mean_mm": report.influence_loss.mean,
+        "influences_max_mm": report.influence_loss.max,
+        "rig_mean_mm": report.total_loss.mean,
+        "rig_max_mm": report.total_loss.max,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("avatar", help="avatar.npz of examples/fit_grab.py")
+    parser.add_argument("--quick", action="store_true", help="fewer frames")
+    parser.add_argument("--json", help="write the figures to this file")
+    args = parser.parse_args()
+    body = xa.synthetic_body()
+    avatar = xa.load_avatar(args.avatar, body=body)
+    motion = held_out_motion(body, 60 if args.quick else 300)
+    start = time.perf_counter()
+    avatar.canonical_mesh()
+    extracted = time.perf_counter()
+    jax.block_until_ready(avatar.posable)
+    ready = time.perf_counter()
+    rows = [
+        measure_animation(
+            avatar.animate(motion, offsets=offsets),
+            {"exact": 3}.get(offsets, 30 if args.quick else 300),
+            2 if args.quick else 12,
+        )
+        for offsets in OFFSETS
+    ]
+    exports = [measure_export(avatar, motion, influences) for influences in (4, 8)]
+    header = {
+        "question": "frames a second of animation, distance to exact frames, time of export",
+        **describe_machine(),
+        "quick": args.quick,
+        "vertices": avatar.canonical_mesh().num_vertices,
+        "frames": len(motion),
+        "preset": avatar.config.preset,
+        "extraction_s": extracted - start,
+        "base_s": ready - extracted,
+        "exports": exports,
+    }
+    for row in (*rows, *exports):
+        print(
+            ", ".join(
+                f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
+            )
+        )
+    if args.json:
+        write_json(args.json, {"header": header, "rows": rows})
+        print(f"written: {args.json}")
+
+
+if __name__ == "__main__":
+    main()

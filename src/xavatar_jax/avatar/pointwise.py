@@ -1,0 +1,67 @@
+"""The fields of an avatar at many canonical points: jitted, in batches of one size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..kinematics import skin_points
+from ..training import AvatarFields, FitConfig
+
+
+def batch_size(config: FitConfig) -> int:
+    """Points a batch: what the geometry field's own memory allows."""
+    return 16_384 if config.geometry.kind == "hash" else 4096
+
+
+@eqx.filter_jit
+def skin_weights(fields: AvatarFields, points: Array) -> Array:
+    return jax.vmap(fields.skinning)(points)
+
+
+@eqx.filter_jit
+def logits(fields: AvatarFields, points: Array, condition: Any) -> Array:
+    return jax.vmap(lambda x: fields.geometry(x, condition))(points)
+
+
+@eqx.filter_jit
+def gradients(fields: AvatarFields, points: Array, condition: Any) -> Array:
+    return jax.vmap(jax.grad(lambda x: fields.geometry(x, condition)))(points)
+
+
+@eqx.filter_jit
+def project(fields: AvatarFields, points: Array, condition: Any) -> Array:
+    """Move points on to the level set by Newton steps along the gradient, 3 mm a step at most."""
+
+    def value(x: Array) -> Array:
+        return fields.geometry(x, condition)
+
+    def one(x: Array) -> Array:
+        for _ in range(3):
+            f, g = jax.value_and_grad(value)(x)
+            slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
+            x = x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
+        return x
+
+    return jax.vmap(one)(points)
+
+
+@eqx.filter_jit
+def skin(fields: AvatarFields, points: Array, transforms: Array) -> Array:
+    return jax.vmap(lambda x: skin_points(x, fields.skinning(x), transforms))(points)
+
+
+def in_batches(function: Any, points: np.ndarray, batch: int) -> np.ndarray:
+    """Apply a jitted function to fixed-size batches, the last one padded: no retracing."""
+    count = len(points)
+    padded = np.concatenate([points, np.repeat(points[:1], -count % batch, axis=0)])
+    parts = [
+        np.asarray(function(jnp.asarray(padded[k : k + batch], jnp.float32)))
+        for k in range(0, len(padded), batch)
+    ]
+    return np.concatenate(parts)[:count]

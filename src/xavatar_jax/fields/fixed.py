@@ -1,0 +1,77 @@
+"""Geometry fields at points that stay where they are, while the condition changes."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+_BATCH = 4096
+
+
+class AbstractFixedPoints(eqx.Module):
+    """A geometry field at N fixed points: logits for one frame's condition after another."""
+
+    @abc.abstractmethod
+    def __call__(self, condition: Any) -> Float[Array, " N"]:
+        """Logits at the points under one condition, as the field itself gives them."""
+
+
+class FixedPoints(AbstractFixedPoints):
+    """Any field: evaluated anew for each condition, some thousand points at a time."""
+
+    field: Callable[[Array, Any], Array]
+    points: Float[Array, "N 3"]
+
+    def __call__(self, condition: Any) -> Float[Array, " N"]:
+        count = len(self.points)
+        padded = jnp.pad(self.points, ((0, -count % _BATCH), (0, 0)))
+        each = jax.vmap(lambda x: self.field(x, condition))
+        return jax.lax.map(each, padded.reshape(-1, _BATCH, 3)).reshape(-1)[:count]
+
+
+class FixedHash(AbstractFixedPoints):
+    """A hash field: of its grids only what the first layer makes of them is kept.
+
+    For each condition there remain a product with the points' nearness to the joints and the
+    small network.
+    """
+
+    first: Float[Array, "N width"]
+    nearness: Float[Array, "N J"]
+    from_condition: Float[Array, "width K"]
+    hidden: tuple[Float[Array, "out in"], ...]
+    biases: tuple[Float[Array, " out"], ...]
+    sharpness: float = eqx.field(static=True)
+
+    def __call__(self, condition: Float[Array, "J K"]) -> Float[Array, " N"]:
+        h = self.first + _matmul(self.nearness, _matmul(condition, self.from_condition.T))
+        for weight, bias in zip(self.hidden, self.biases, strict=True):
+            h = _matmul(_softplus(h, self.sharpness), weight.T) + bias
+        return h[:, 0]
+
+
+def _matmul(a: Array, b: Array) -> Array:
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+
+
+# log(1 + u) for u from 0 to 1, to 6e-9: three times as fast as the library's own.
+_LOG1P = (
+    np.polynomial.chebyshev.Chebyshev.interpolate(np.log1p, 9, [0, 1])
+    .convert(kind=np.polynomial.Polynomial)
+    .coef
+)
+
+
+def _softplus(x: Array, sharpness: float) -> Array:
+    u = jnp.exp(-sharpness * jnp.abs(x))
+    log = jnp.full_like(u, _LOG1P[-1])
+    for coefficient in _LOG1P[-2::-1]:
+        log = log * u + jnp.asarray(coefficient, u.dtype)
+    return jnp.maximum(x, 0) + log / sharpness

@@ -1,0 +1,1 @@
+"""What the tests of GLB files use: a reader of their own, and other people's programs."""
