@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -159,6 +160,23 @@ def least_time(run: Callable[[], Any], repeats: int) -> tuple[Any, float]:
         result = jax.block_until_ready(run())
         spent.append(time.perf_counter() - clock)
     return result, min(spent)
+
+
+def peak_rise_mb(run: Callable[[], Any]) -> float | None:
+    """By how much resident memory rises at most while something runs, MiB; None if not Linux."""
+    mark, status = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+    try:
+        mark.write_text("5")  # the high-water mark starts again from here
+        before = _resident_kb(status, "VmRSS")
+        run()
+        return max(_resident_kb(status, "VmHWM") - before, 0) / 1024
+    except OSError:
+        return None
+
+
+def _resident_kb(status: Path, name: str) -> int:
+    line = next(v for v in status.read_text().splitlines() if v.startswith(name))
+    return int(line.split()[1])
 
 
 def print_rows(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
