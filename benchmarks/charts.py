@@ -24,7 +24,7 @@ def log_chart(
     from PIL import Image, ImageDraw
 
     width, height = size
-    left, right, top, bottom = 78, 14, 40, 58
+    left, right, top, bottom = 78, 40, 40, 58
     points = np.array([p for line in lines.values() for p in line], float)
     low, high = np.log10(points.min(0)), np.log10(points.max(0))
     low[1], high[1] = np.floor(low[1]), np.ceil(high[1] + 1e-9)

@@ -460,20 +460,9 @@ def contact_table(
                         roots = search_field(f, x, part, transforms, t, guide=guide, keep=keep)
                     return np.asarray(roots.x_c), np.asarray(roots.valid)
 
-                whole, share = score(made[of], search, getattr(made[of], row_of))
-                rows.append(
-                    {
-                        "table": "contact",
-                        "case": name,
-                        "path": path,
-                        "field": of,
-                        "starts": starts,
-                        "points": len(whole),
-                        "roots_per_point": float(made[of].known.sum(1).mean()),
-                        "share_of_points_with_every_root": float(whole.mean()),
-                        "share_of_roots": share,
-                    }
-                )
+                shares = score(made[of], search, getattr(made[of], row_of))
+                label = {"case": name, "path": path, "field": of, "starts": starts}
+                rows.append({"table": "contact", **label, **shares})
                 print_rows(rows[-1:], tuple(rows[-1])[1:])
     return rows
 

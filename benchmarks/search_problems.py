@@ -74,10 +74,12 @@ def near_surface(
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, " P"]]:
     """Canonical points around vertices, half of them of the body, and their parts."""
+    each = [int(count * share) for _, share in SHARES]
+    each[0] += count - sum(each)  # what rounding left
     rows = np.concatenate(
         [
-            rng.choice(np.flatnonzero(np.isin(labels, parts)), int(count * share))
-            for parts, share in SHARES
+            rng.choice(np.flatnonzero(np.isin(labels, parts)), own)
+            for (parts, _), own in zip(SHARES, each, strict=True)
         ]
     )
     points = vertices[rows] + NOISE_M * rng.standard_normal((len(rows), 3))

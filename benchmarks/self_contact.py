@@ -33,12 +33,17 @@ PRESSED_M = 0.003  # how deep skin gives way where it touches, on either side
 
 
 class Contact(NamedTuple):
-    """Q posed points with R canonical ones each, where `known`; labels and nearest parts."""
+    """Q posed points with R canonical ones each, where `known`; labels and nearest parts.
+
+    `upright`: known, and the field's map keeps its orientation there. Between fingers that bend far
+    it turns space inside out: such points solve the equations and are no place of the body.
+    """
 
     name: str
     x_d: Float[np.ndarray, "Q 3"]
     x_c: Float[np.ndarray, "Q R 3"]
     known: Bool[np.ndarray, "Q R"]
+    upright: Bool[np.ndarray, "Q R"]
     label: Int[np.ndarray, " Q"]
     pair_row: Int[np.ndarray, " Q"]
     transforms: Float[Array, "J 4 4"]
@@ -242,8 +247,9 @@ def contact_points(
         vertices, np.asarray(body.faces), x.reshape(-1, 3)[flat].astype(np.float64)
     )
     good.ravel()[flat] = depth > -OUTSIDE_M
-    x_c, known = _distinct(x, good)
-    several = np.array([_spread(p[k]) > APART_M for p, k in zip(x_c, known, strict=True)], bool)
+    x_c, turned, known = _distinct(x, det, good)
+    upright = known & (turned > 0)
+    several = np.array([_spread(p[k]) > APART_M for p, k in zip(x_c, upright, strict=True)], bool)
     chosen = np.flatnonzero(several)[:count]
     if len(chosen) < count // 4:
         raise ValueError(f"{name}: {len(chosen)} points of contact, expected {count}")
@@ -266,23 +272,27 @@ def contact_points(
         x_d,
         x_c[chosen],
         known[chosen],
+        upright[chosen],
         order[:, 0].astype(np.int32),
         PAIR_ROWS[order[:, 0], second].astype(np.int32),
         transforms,
     )
 
 
-def _distinct(x: np.ndarray, good: np.ndarray, most: int = 8) -> tuple[np.ndarray, np.ndarray]:
+def _distinct(
+    x: np.ndarray, det: np.ndarray, good: np.ndarray, most: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of candidates `(Q, C, 3)` those that are good and no repetition, up to `most`."""
     points, known = np.zeros((len(x), most, 3), np.float32), np.zeros((len(x), most), bool)
+    turned = np.zeros((len(x), most), np.float32)
     for q in range(len(x)):
-        kept: list[np.ndarray] = []
-        for point in x[q][good[q]]:
-            if len(kept) < most and all(np.linalg.norm(point - p) > 1e-3 for p in kept):
-                kept.append(point)
-        points[q, : len(kept)] = np.reshape(kept, (-1, 3))
+        kept: list[int] = []
+        for c in np.flatnonzero(good[q]):
+            if len(kept) < most and all(np.linalg.norm(x[q, c] - x[q, k]) > 1e-3 for k in kept):
+                kept.append(int(c))
+        points[q, : len(kept)], turned[q, : len(kept)] = x[q, kept], det[q, kept]
         known[q, : len(kept)] = True
-    return points, known
+    return points, turned, known
 
 
 def _spread(points: np.ndarray) -> float:
@@ -297,10 +307,16 @@ def score(
     search: Callable[[Array, Array, Array], tuple[np.ndarray, np.ndarray]],
     rows: Int[np.ndarray, " Q"],
     within_m: float = 1e-4,
-) -> tuple[Bool[np.ndarray, " Q"], float]:
-    """Points all of whose canonical ones a search finds, and the share of those it finds."""
+) -> dict[str, float]:
+    """Shares of points all of whose canonical ones a search finds, and of those it finds."""
     x_c, valid = search(jnp.asarray(contact.x_d), jnp.asarray(rows), contact.transforms)
     gap = np.linalg.norm(contact.x_c[:, :, None] - x_c[:, None], axis=-1)
     found = np.where(valid[:, None], gap, np.inf).min(-1) < within_m
-    whole = (found | ~contact.known).all(1)
-    return whole, float(found[contact.known].mean())
+    return {
+        "points": len(found),
+        "roots_per_point": float(contact.upright.sum(1).mean()),
+        "share_of_points_with_every_root": float((found | ~contact.upright).all(1).mean()),
+        "share_of_roots": float(found[contact.upright].mean()),
+        "inverted_roots_per_point": float((contact.known & ~contact.upright).sum(1).mean()),
+        "share_of_points_with_inverted_roots_too": float((found | ~contact.known).all(1).mean()),
+    }
