@@ -374,7 +374,7 @@ def resolution_table(
     table, rows = start_table(body.tree, "part_aware"), []
     weigh = eqx.filter_jit(lambda field, x: jax.vmap(field)(x))
     for mm in size.resolutions_mm:
-        fields = tabulated(body, vertices, mlp, mm, 1)
+        fields = tabulated(body, vertices, mlp, mm)
         cases = hard_problems(
             body, fields.grid, vertices, degrees=20.0, frames=2, count=size.points, seed=seed
         )

@@ -29,6 +29,7 @@ NEAR_PART_M = 0.03  # a point this close to two parts takes the starts of both
 OUTSIDE_M = 0.01  # canonical points that count lie inside the body, or at most this far outside
 APART_M = 0.02  # two canonical points this far apart are two places, not one found twice
 TOUCHING_M = 0.004
+LEAST_POINTS = 10  # fewer would say nothing
 PRESSED_M = 0.003  # how deep skin gives way where it touches, on either side
 
 
@@ -211,7 +212,7 @@ def contact_points(
     rng = np.random.default_rng([seed, 2])
     transforms = jnp.asarray(xa.bone_transforms(body, params), jnp.float32)
     labels = np.asarray(body.part_labels)
-    hand = rng.choice(np.flatnonzero(labels == LEFT_HAND), 20 * count)
+    hand = rng.choice(np.flatnonzero(labels == LEFT_HAND), 60 * count)
     own = (vertices[hand] + 0.004 * rng.standard_normal((len(hand), 3))).astype(np.float32)
     posed = np.asarray(carry(field, jnp.asarray(own), transforms))
     trees = [KDTree(np.asarray(carry(field, jnp.asarray(n), transforms))) for n in nodes]
@@ -222,7 +223,7 @@ def contact_points(
         there = canonical[np.minimum(near, len(canonical) - 1)]
         away = np.linalg.norm(there - own[:, None], axis=-1) > APART_M
         touching |= (np.isfinite(gap) & away).any(1)
-    rows = np.flatnonzero(touching)[: 2 * count]
+    rows = np.flatnonzero(touching)[: 3 * count]
     posed = posed[rows]
     starts, targets = [], []
     for canonical, tree in zip(nodes, trees, strict=True):
@@ -251,8 +252,10 @@ def contact_points(
     upright = known & (turned > 0)
     several = np.array([_spread(p[k]) > APART_M for p, k in zip(x_c, upright, strict=True)], bool)
     chosen = np.flatnonzero(several)[:count]
-    if len(chosen) < count // 4:
-        raise ValueError(f"{name}: {len(chosen)} points of contact, expected {count}")
+    if len(chosen) < LEAST_POINTS:
+        raise ValueError(
+            f"{name}: {len(chosen)} points of contact, expected {LEAST_POINTS} or more"
+        )
     x_d = posed[chosen]
     surface = np.asarray(skin_points(jnp.asarray(vertices), jnp.asarray(body.weights), transforms))
     distance = np.stack(
