@@ -4,6 +4,7 @@
     python docs/figures/update.py --metrics out/fit_grab/metrics.json
     python docs/figures/update.py --part-aware part_aware.json
     python docs/figures/update.py --animate animate.json
+    python docs/figures/update.py --correspondence search.json --gradients gradients.json
 
 A result is copied into this folder without what is of no use elsewhere (paths, single frames).
 A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`; the table
@@ -22,9 +23,16 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "figures"
-TEXTS = ("README.md", "docs/benchmarks.md", "docs/options.md", "docs/animate-and-export.md")
+TEXTS = (
+    "README.md",
+    "docs/animate-and-export.md",
+    "docs/benchmarks.md",
+    "docs/choose.md",
+    "docs/options.md",
+)
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
 ANIMATE = "animate.json"
+SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
 
@@ -194,6 +202,171 @@ def export_view(record: dict[str, Any]) -> str:
     return f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['frames']} frames."
 
 
+_PATHS = {
+    ("plain", "mlp"): "network, plain path",
+    ("batched", "mlp"): "network, batched",
+    ("guided", "mlp"): "network, guided by the grid",
+    ("plain", "grid"): "grid, plain path",
+    ("grid", "grid"): "grid",
+}
+_PATH_COLUMNS = (
+    ("points_per_s", "points/s", 0),
+    ("points_per_s_with_tables", "with tables", 0),
+    ("times_plain", "times plain", 1),
+    ("recall_all", "found, all", 4),
+    ("recall_body", "body", 4),
+    ("recall_face", "face", 4),
+    ("recall_hands", "hands", 4),
+    ("residual_max_um", "largest residual, µm", 1),
+    ("steps_per_start", "steps a start", 1),
+    ("starts_per_point", "starts a point", 1),
+    ("compile_s", "compile, s", 1),
+)
+_BATCH_COLUMNS = (
+    ("points", "points at once", 0),
+    ("points_per_s", "points/s", 0),
+    ("cost_ratio", "cost a point, against the least", 2),
+    ("temporary_mb", "temporary memory, MiB", 0),
+    ("rss_rise_mb", "rise of resident memory, MiB", 0),
+)
+_RESOLUTION_COLUMNS = (
+    ("nodes", "nodes", 0),
+    ("table_mb", "table, MiB", 0),
+    ("tabulate_s", "tabulate, s", 1),
+    ("weight_error_mean", "weight error", 4),
+    ("weight_error_hands_mean", "hands", 4),
+    ("posed_error_median_mm", "posed error, median, mm", 2),
+    ("posed_error_p99_mm", "99 %", 1),
+    ("grid_points_per_s", "grid, points/s", 0),
+    ("grid_recall_all", "grid, found", 4),
+    ("guided_points_per_s", "guided, points/s", 0),
+    ("guided_recall_all", "guided, found", 4),
+    ("guided_recall_hands", "hands", 4),
+)
+_CONTACT_COLUMNS = (
+    ("points", "points", 0),
+    ("roots_per_point", "roots a point", 2),
+    ("share_of_points_with_every_root", "points with every root", 4),
+    ("share_of_roots", "roots found", 4),
+    ("inverted_roots_per_point", "inverted roots a point", 2),
+    ("share_of_points_with_inverted_roots_too", "points with those too", 4),
+)
+
+
+def paths_view(degrees: float) -> Callable[[dict[str, Any]], str]:
+    """Paths x fields x start sets at one difficulty."""
+
+    def view(record: dict[str, Any]) -> str:
+        rows = [["path", "starts", *(label for _, label, _ in _PATH_COLUMNS)]]
+        for row in _of_table(record, "paths"):
+            if row["pose_deg"] == degrees:
+                row = {**row, "residual_max_um": 1e6 * row["residual_max_m"]}
+                name = _PATHS[row["path"], row["field"]]
+                rows.append([name, f"`{row['starts']}`", *_cells(row, _PATH_COLUMNS)])
+        return _with_run(rows, record)
+
+    return view
+
+
+def batches_view(record: dict[str, Any]) -> str:
+    """Cost a point and memory against batch size."""
+    rows = [["path", *(label for _, label, _ in _BATCH_COLUMNS)]]
+    found = _of_table(record, "batches")
+    best: dict[str, float] = {}
+    for row in found:
+        best[row["path"]] = max(best.get(row["path"], 0.0), row["points_per_s"])
+    for row in found:
+        row = {**row, "cost_ratio": best[row["path"]] / row["points_per_s"]}
+        rows.append([_PATHS[row["path"], row["field"]], *_cells(row, _BATCH_COLUMNS)])
+    return _with_run(rows, record)
+
+
+def resolution_view(record: dict[str, Any]) -> str:
+    """Grids of several spacings, beside the network that they tabulate."""
+    rows = [["body, hands, face, mm", *(label for _, label, _ in _RESOLUTION_COLUMNS)]]
+    for row in _of_table(record, "resolution"):
+        spacing = ", ".join(f"{row[f'{name}_mm']:g}" for name in ("body", "hands", "face"))
+        rows.append([spacing, *_cells(row, _RESOLUTION_COLUMNS)])
+    return _with_run(rows, record)
+
+
+def contact_view(record: dict[str, Any]) -> str:
+    """Whether every canonical point is found where a body touches itself."""
+    rows = [["case", "path", "starts", *(label for _, label, _ in _CONTACT_COLUMNS)]]
+    for row in _of_table(record, "contact"):
+        name = _PATHS[row["path"], row["field"]]
+        rows.append([row["case"], name, row["starts"], *_cells(row, _CONTACT_COLUMNS)])
+    return _with_run(rows, record)
+
+
+def accuracy_of_gradients_view(record: dict[str, Any]) -> str:
+    """Errors beside finite differences."""
+    rows = [["method", "by", "mode", "largest error", "median", "below 1e-5"]]
+    for row in _of_table(record, "accuracy"):
+        errors = (f"{row[name]:.1e}" for name in ("relative_error_max", "relative_error_median"))
+        share = f"{row['share_below_1e-5']:.4f}"
+        rows.append([row["method"], row["by"], row["mode"], *errors, share])
+    header = record["header"]
+    return (
+        f"{_with_run(rows, record)[:-1]}, {header['regular_points']} of {header['points']} points "
+        f"with a determinant of {header['min_determinant']} or more."
+    )
+
+
+def float32_view(record: dict[str, Any]) -> str:
+    """Derivatives in float32 beside those in float64."""
+    rows = [["roots", "by", "largest gap", "99 %", "median", "below 1e-3"]]
+    for row in _of_table(record, "float32"):
+        names = ("relative_gap_max", "relative_gap_p99", "relative_gap_median")
+        gaps = (f"{row[name]:.1e}" for name in names)
+        rows.append([row["at"], row["by"], *gaps, f"{row['share_below_1e-3']:.4f}"])
+    return _with_run(rows, record)
+
+
+def time_of_gradients_view(record: dict[str, Any]) -> str:
+    """Roots and their derivatives by the field's parameters, milliseconds."""
+    rows = [["method", "mode", "ms for 1000 points", "first call, s"]]
+    for row in _of_table(record, "time"):
+        rows.append(
+            [
+                row["method"],
+                row["mode"],
+                f"{row['ms_per_1000_points']:.0f}",
+                f"{row['first_call_s']:.1f}",
+            ]
+        )
+    (step,) = _of_table(record, "step")
+    return (
+        f"{_with_run(rows, record)} A step of training with the search inside compiles in "
+        f"{step['compile_s']:.1f} s and is traced {step['traces']} time in two calls."
+    )
+
+
+def _of_table(record: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    return [row for row in record["rows"] if row["table"] == name]
+
+
+def _cells(row: dict[str, Any], columns: tuple[tuple[str, str, int], ...]) -> list[str]:
+    # A dash: this path has no such figure.
+    found = [(row.get(name), digits) for name, _, digits in columns]
+    return ["–" if value is None else f"{value:.{digits}f}" for value, digits in found]
+
+
+def _with_run(rows: list[list[str]], record: dict[str, Any]) -> str:
+    header = record["header"]
+    size = "quick" if header["quick"] else "full"
+    if len(rows) == 1:
+        return "Not part of a quick run."
+    grid = ""
+    if "grid_mm" in header:
+        spacing = ", ".join(f"{value:g}" for value in header["grid_mm"])
+        grid = f", grid of {spacing} mm (body, hands, face)"
+    return (
+        f"{_table(rows)}\n\n{_sentence(_machine(header))}; {size} run, seed {header['seed']}, "
+        f"network fitted in {header['prefit_steps']} steps{grid}."
+    )
+
+
 def presets_view() -> str:
     """Entries of the two presets, side by side."""
     import xavatar_jax as xa
@@ -212,6 +385,14 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{PART_AWARE}": benchmark_view,
     f"docs/figures/{ANIMATE}": animate_view,
     f"docs/figures/{ANIMATE} export": export_view,
+    f"docs/figures/{SEARCH} 20": paths_view(20.0),
+    f"docs/figures/{SEARCH} 40": paths_view(40.0),
+    f"docs/figures/{SEARCH} batches": batches_view,
+    f"docs/figures/{SEARCH} resolution": resolution_view,
+    f"docs/figures/{SEARCH} contact": contact_view,
+    f"docs/figures/{GRADIENTS} accuracy": accuracy_of_gradients_view,
+    f"docs/figures/{GRADIENTS} float32": float32_view,
+    f"docs/figures/{GRADIENTS} time": time_of_gradients_view,
 }
 _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
@@ -267,6 +448,8 @@ def main() -> None:
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
     parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
     parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
+    parser.add_argument("--correspondence", help="JSON of benchmarks/correspondence.py")
+    parser.add_argument("--gradients", help="JSON of benchmarks/gradients.py")
     args = parser.parse_args()
     if args.metrics:
         _store(args.metrics, METRICS, slim_metrics)
@@ -274,6 +457,10 @@ def main() -> None:
         _store(args.part_aware, PART_AWARE, slim_benchmark)
     if args.animate:
         _store(args.animate, ANIMATE, slim_benchmark)
+    if args.correspondence:
+        _store(args.correspondence, SEARCH, slim_benchmark)
+    if args.gradients:
+        _store(args.gradients, GRADIENTS, slim_benchmark)
     for name in TEXTS:
         path = ROOT / name
         path.write_text(filled(path.read_text("utf-8")), encoding="utf-8")

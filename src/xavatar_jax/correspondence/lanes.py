@@ -132,7 +132,10 @@ class _Driver(NamedTuple):
     def narrow(self, block: _Block, widths: list[int]) -> Solved:
         """Step until the rest fits the next width; go on with the rest alone."""
         smaller = widths[1] if len(widths) > 1 else 0
-        block = jax.lax.while_loop(lambda b: jnp.sum(b.going) > smaller, self.advance, block)
+        # The lanes of the narrowest blocks are lost ones, which meet no other.
+        merging = self.merge > 0 and self.group_size > 1 and len(widths) > 2
+        advance = self.advance_and_merge if merging else self.advance
+        block = jax.lax.while_loop(lambda b: jnp.sum(b.going) > smaller, advance, block)
         residual = _norm(block.state)
         solved = Solved(block.y, residual, block.steps, block.merged)
         if not smaller:
@@ -154,18 +157,19 @@ class _Driver(NamedTuple):
         return self.close(block._replace(y=y, state=state, steps=block.steps + block.going))
 
     def close(self, block: _Block) -> _Block:
-        """End the lanes that are done, by the solver's own rule, the count or another lane."""
+        """End the lanes that are done, by the solver's own rule or the count."""
 
         def ended(y: Array, a: PyTree, state: Any) -> Array:
             return self.solver.terminate(self.fn, y, a, {}, state, frozenset())[0]
 
         done = jax.vmap(ended)(block.y, block.args, block.state)
-        going = block.going & ~done & (block.steps < self.max_steps)
-        if self.merge and self.group_size > 1:
-            near = _near_better(block, min(self.group_size - 1, _REACH), self.merge)
-            merged = going & near
-            return block._replace(going=going & ~near, merged=block.merged | merged)
-        return block._replace(going=going)
+        return block._replace(going=block.going & ~done & (block.steps < self.max_steps))
+
+    def advance_and_merge(self, block: _Block) -> _Block:
+        """The same; then lanes end that have come close to a better one of their group."""
+        block = self.advance(block)
+        near = block.going & _near_better(block, min(self.group_size - 1, _REACH), self.merge)
+        return block._replace(going=block.going & ~near, merged=block.merged | near)
 
 
 def _near_better(block: _Block, reach: int, radius: float) -> Bool[Array, " W"]:
