@@ -79,7 +79,8 @@ class Best:
         if loss < self.loss:
             self.loss, self.step = loss, step
             self.learned = jax.tree.map(jnp.copy, learned)
-        if loss < self.mark * (1 - config.gain):
+        # The first loss is a gain over none, whatever the share asked for.
+        if not np.isfinite(self.mark) or loss < self.mark * (1 - config.gain):
             self.mark, self.gained = loss, step
 
     def plateau(self, step: int, config: FitConfig) -> bool:
