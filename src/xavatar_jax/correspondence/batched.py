@@ -28,7 +28,7 @@ MERGE = 1e-3
 # Points searched at a time: bounds memory, and costs nothing above a few thousand.
 CHUNK = 8192
 
-Solve = Callable[[Array, Array, Array], Solved]
+Solve = Callable[..., Solved]
 Covers = Callable[[Array], Array]
 
 
@@ -64,19 +64,7 @@ def search_grid(
         point, jacobian = grid(x)
         return point - target, jacobian
 
-    def solve(start: Array, target: Array, active: Array) -> Solved:
-        return solve_lanes(
-            solver,
-            residual,
-            start,
-            target,
-            active,
-            max_steps=max_steps,
-            width=width,
-            group_size=starts.width,
-            merge=merge,
-        )
-
+    solve = partial(solve_lanes, solver, residual, max_steps=max_steps, width=width, merge=merge)
     return _search(solve, grid.grids.covers, solver, x_d, parts, transforms, starts, keep, chunk)
 
 
@@ -116,20 +104,15 @@ def search_field(
         jacobian = jax.jacfwd(lambda v: residual(v, target)[0])(x)
         return {"inverse_jacobian": inverse_3x3(jacobian)}
 
-    def solve(start: Array, target: Array, active: Array) -> Solved:
-        return solve_lanes(
-            solver,
-            residual,
-            start,
-            target,
-            active,
-            options=options,
-            max_steps=max_steps,
-            width=width,
-            group_size=starts.width,
-            merge=merge,
-        )
-
+    solve = partial(
+        solve_lanes,
+        solver,
+        residual,
+        options=options,
+        max_steps=max_steps,
+        width=width,
+        merge=merge,
+    )
     covers = jax.vmap(field.covers)
     return _search(solve, covers, solver, x_d, parts, transforms, starts, keep, chunk)
 
@@ -206,7 +189,7 @@ def _search(
         pulled = pull_back_all(x, transforms, starts)
         start = jnp.take_along_axis(pulled, starts.index[part][..., None], axis=1)
         target = jnp.repeat(x, starts.width, axis=0)
-        solved = solve(start.reshape(-1, 3), target, usable.reshape(-1))
+        solved = solve(start.reshape(-1, 3), target, usable.reshape(-1), group_size=starts.width)
         converged = solved.residual < solver.atol
         valid = converged & covers(solved.y)
         residual, converged, valid = (

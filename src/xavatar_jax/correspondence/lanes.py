@@ -29,14 +29,12 @@ class Solved(NamedTuple):
 
     - `y`: `(L, n)` the last iterate; `residual`: `(L,)` its norm, infinite for lanes that were not
       active.
-    - `steps`: `(L,)`; `merged`: `(L,)` ended because another lane of its group had come to the
-      same place.
+    - `steps`: `(L,)`.
     """
 
     y: Float[Array, "L n"]
     residual: Float[Array, " L"]
     steps: Int[Array, " L"]
-    merged: Bool[Array, " L"]
 
 
 class _Block(NamedTuple):
@@ -48,7 +46,6 @@ class _Block(NamedTuple):
     group: Int[Array, " W"]
     going: Bool[Array, " W"]
     steps: Int[Array, " W"]
-    merged: Bool[Array, " W"]
 
 
 def solve_lanes(
@@ -95,16 +92,10 @@ def solve_lanes(
         jnp.zeros((size, *start.shape[1:]), start.dtype),
         jnp.full(size, jnp.inf, start.dtype),
         jnp.zeros(size, jnp.int32),
-        jnp.zeros(size, bool),
     )
     out = jax.lax.fori_loop(0, -(-place[-1] // width), block, out)
-    y, residual, steps, merged = _take(out, place - 1)
-    return Solved(
-        y,
-        jnp.where(active, residual, jnp.inf),
-        jnp.where(active, steps, 0),
-        active & merged,
-    )
+    y, residual, steps = _take(out, place - 1)
+    return Solved(y, jnp.where(active, residual, jnp.inf), jnp.where(active, steps, 0))
 
 
 class _Driver(NamedTuple):
@@ -124,9 +115,8 @@ class _Driver(NamedTuple):
             return self.solver.init(self.fn, y, a, self.options(y, a), None, None, frozenset())
 
         state = jax.vmap(init)(y, args)
-        none = jnp.zeros_like(active)
         steps = jnp.zeros(active.shape, jnp.int32)
-        block = _Block(y, state, args, group, active, steps, none)
+        block = _Block(y, state, args, group, active, steps)
         return self.narrow(self.close(block), widths)
 
     def narrow(self, block: _Block, widths: list[int]) -> Solved:
@@ -137,7 +127,7 @@ class _Driver(NamedTuple):
         advance = self.advance_and_merge if merging else self.advance
         block = jax.lax.while_loop(lambda b: jnp.sum(b.going) > smaller, advance, block)
         residual = _norm(block.state)
-        solved = Solved(block.y, residual, block.steps, block.merged)
+        solved = Solved(block.y, residual, block.steps)
         if not smaller:
             return solved
         place = jnp.cumsum(block.going)
@@ -168,8 +158,8 @@ class _Driver(NamedTuple):
     def advance_and_merge(self, block: _Block) -> _Block:
         """The same; then lanes end that have come close to a better one of their group."""
         block = self.advance(block)
-        near = block.going & _near_better(block, min(self.group_size - 1, _REACH), self.merge)
-        return block._replace(going=block.going & ~near, merged=block.merged | near)
+        near = _near_better(block, min(self.group_size - 1, _REACH), self.merge)
+        return block._replace(going=block.going & ~near)
 
 
 def _near_better(block: _Block, reach: int, radius: float) -> Bool[Array, " W"]:
