@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..body import BodyModel, BodyParams, bone_transforms, canonical_vertices
-from ..correspondence import ClosedFormNewton, search_grid, start_table
+from ..correspondence import ClosedFormNewton, StartTable, search_grid, start_table
 from ..fields import (
     AbstractSkinningField,
     GridSkinning,
@@ -24,7 +24,7 @@ from ..frames import Frame, Frames, nearest_part_labels
 from ..kinematics import skin_points, solve_3x3
 from ..sampling import sample_frame
 from .check import FrameCheck
-from .config import FitConfig
+from .config import FitConfig, SearchConfig
 
 
 class FramePool(eqx.Module):
@@ -127,26 +127,37 @@ def find_roots(
     starts = start_table(body.tree, config.search.starts)
     solver = ClosedFormNewton(atol=config.search.atol, divergence=1.0)
 
-    @eqx.filter_jit
-    def search(table: TabulatedSkinning, x: Array, parts: Array, transforms: Array):
-        found = search_grid(
-            pose_grid(table, transforms),
-            x,
-            parts,
-            transforms,
-            starts,
-            solver=solver,
-            keep=config.search.keep,
-            max_steps=config.search.max_steps,
-        )
-        return found.x_c, found.valid
-
     rows = []
     for k in range(pool.points.shape[0]):
-        x_c, valid = search(table, pool.points[k], pool.parts[k], pool.transforms[k])
+        frame = pool.points[k], pool.parts[k], pool.transforms[k]
+        x_c, valid = _search_frame(table, *frame, starts, solver, config.search)
         rows.append((np.asarray(x_c), np.asarray(valid)))
         bar.update(1)
     return _ordered(pool, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
+
+
+# Here and below: made once, so that a second run, or the next polish, does not compile again.
+@eqx.filter_jit
+def _search_frame(
+    table: TabulatedSkinning,
+    points: Float[Array, "N 3"],
+    parts: Int[Array, " N"],
+    transforms: Float[Array, "J 4 4"],
+    starts: StartTable,
+    solver: ClosedFormNewton,
+    options: SearchConfig,
+) -> tuple[Array, Array]:
+    found = search_grid(
+        pose_grid(table, transforms),
+        points,
+        parts,
+        transforms,
+        starts,
+        solver=solver,
+        keep=options.keep,
+        max_steps=options.max_steps,
+    )
+    return found.x_c, found.valid
 
 
 def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool:
@@ -183,28 +194,31 @@ def polish_roots(
 
     Residuals are the field's own; Jacobians are the table's, which are close and cost a lookup.
     """
-
-    @eqx.filter_jit
-    def polish(field: AbstractSkinningField, table: TabulatedSkinning, frames: tuple) -> tuple:
-        def one_frame(frame: tuple) -> tuple:
-            points, root, others, transforms = frame
-            grid = pose_grid(table, transforms)
-
-            def newton(x: Array, target: Array) -> Array:
-                _, jacobian = grid(x)
-                off = skin_points(x, field(x), transforms) - target
-                step = solve_3x3(jacobian, off)
-                # A root that has to go further than this was not this root.
-                ok = jnp.sum(step**2) < 0.02**2
-                return jnp.where(ok, x - step, x)
-
-            targets = jnp.broadcast_to(points[: others.shape[0], None], others.shape)
-            for _ in range(steps):
-                root = jax.vmap(newton)(root, points)
-                others = jax.vmap(jax.vmap(newton))(others, targets)
-            return root, others
-
-        return jax.lax.map(one_frame, frames)
-
-    root, others = polish(skinning, table, (pool.points, pool.root, pool.others, pool.transforms))
+    stored = pool.points, pool.root, pool.others, pool.transforms
+    root, others = _polish(skinning, table, stored, steps)
     return eqx.tree_at(lambda p: (p.root, p.others), pool, (root, others))
+
+
+@eqx.filter_jit
+def _polish(
+    field: AbstractSkinningField, table: TabulatedSkinning, stored: tuple, steps: int
+) -> tuple[Array, Array]:
+    def one_frame(frame: tuple) -> tuple:
+        points, root, others, transforms = frame
+        grid = pose_grid(table, transforms)
+
+        def newton(x: Array, target: Array) -> Array:
+            _, jacobian = grid(x)
+            off = skin_points(x, field(x), transforms) - target
+            step = solve_3x3(jacobian, off)
+            # A root that has to go further than this was not this root.
+            ok = jnp.sum(step**2) < 0.02**2
+            return jnp.where(ok, x - step, x)
+
+        targets = jnp.broadcast_to(points[: others.shape[0], None], others.shape)
+        for _ in range(steps):
+            root = jax.vmap(newton)(root, points)
+            others = jax.vmap(jax.vmap(newton))(others, targets)
+        return root, others
+
+    return jax.lax.map(one_frame, stored)
