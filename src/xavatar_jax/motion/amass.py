@@ -18,7 +18,15 @@ from ..files import atomic_path
 from .convert import MotionNotice
 from .format import DEFAULT_FPS, Format, ReadOptions, Source
 from .record import Motion
-from .values import Side, absolute_hands, listing, one_shape, rotation_vectors, text
+from .values import (
+    Side,
+    absolute_hands,
+    listing,
+    one_shape,
+    rotation_vectors,
+    smplx_poses,
+    text,
+)
 
 _FPS_KEYS = ("mocap_frame_rate", "mocap_framerate", "fps")
 # Key and number of joints, in the order of the 55 SMPL-X joints.
@@ -94,9 +102,7 @@ def save_amass(path: str | Path, motion: Motion) -> Path:
             f"{motion.source}: AMASS archives hold SMPL-X joints; not among them: "
             f"{', '.join(foreign)}."
         )
-    poses = np.zeros((len(motion), len(SMPLX_TREE.names), 3))
-    for name in motion.joint_names:
-        poses[:, SMPLX_TREE.names.index(name)] = motion.joint(name)
+    poses, _ = smplx_poses(motion)  # leaves nothing out: no joint is foreign
     foreign_shape = motion.model not in ("smplx", "unknown") and motion.betas.any()
     betas = np.zeros(10) if foreign_shape else motion.betas
     gender = motion.gender if motion.gender in _GENDERS else "neutral"

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..body import SMPLX_TREE, BodyModel, pose_groups
+from ..body import BodyModel
 from ..files import atomic_folder, atomic_path
 from .convert import MotionNotice
 from .record import Motion
-from .values import relative_hands, smplx_poses
+from .values import grouped_poses
 
 # NumPy 2 names its functions by a new module, which the NumPy 1 of many Blenders has not; both
 # know the old name. Protocol 2 writes names without their length, so that they can be replaced.
@@ -65,16 +65,9 @@ def save_poses(path: str | Path, motion: Motion, body: BodyModel) -> Path:
 
 
 def _frames(motion: Motion, body: BodyModel) -> tuple[list[dict[str, np.ndarray]], list[str]]:
-    poses, notices = smplx_poses(motion)
+    poses, notices = grouped_poses(motion, body)
     notices.append(f"{motion.source}: pose pickles hold no frame rate ({motion.fps:g} a second).")
-    parts = {"transl": motion.transl, "expression": np.asarray(motion.expression)}
-    for name, joints in pose_groups(SMPLX_TREE).items():
-        pose = poses[:, list(joints)]
-        if name.endswith("hand_pose"):
-            side = "left" if name.startswith("left") else "right"
-            parts[name] = relative_hands(pose, body, side)
-        else:
-            parts[name] = pose.reshape(len(motion), -1)
+    parts = {"transl": motion.transl, "expression": np.asarray(motion.expression), **poses}
     parts["betas"] = np.broadcast_to(motion.betas, (len(motion), len(motion.betas)))
     frames = [
         {name: np.ascontiguousarray(values[[k]]) for name, values in parts.items()}

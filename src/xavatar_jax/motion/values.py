@@ -232,6 +232,22 @@ def smplx_poses(motion: Motion) -> tuple[np.ndarray, list[str]]:
     ]
 
 
+def grouped_poses(
+    motion: Motion, body: BodyModel
+) -> tuple[dict[str, Float[np.ndarray, "T n"]], list[str]]:
+    """Poses by SMPL-X's parameter names, hands relative to the body's mean, and notices."""
+    poses, notices = smplx_poses(motion)
+    parts = {}
+    for name, joints in pose_groups(SMPLX_TREE).items():
+        pose = poses[:, list(joints)]
+        if name.endswith("hand_pose"):
+            side = "left" if name.startswith("left") else "right"
+            parts[name] = relative_hands(pose, body, side)
+        else:
+            parts[name] = pose.reshape(len(motion), -1)
+    return parts, notices
+
+
 def text(value: Any) -> str:
     """A word stored as a string, as bytes, or as an array of either."""
     item = np.asarray(value).reshape(-1)[0]

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..body import SMPLX_TREE, BodyModel, pose_groups
+from ..body import BodyModel
 from ..files import atomic_path
 from .convert import MotionNotice, fit_size
 from .format import Format, ReadOptions, Source
 from .params import read_frames, to_motion
 from .record import Motion
-from .values import relative_hands, smplx_poses
+from .values import grouped_poses
 
 _FIXED = 99
 _COEFFICIENTS = 10
@@ -71,16 +71,8 @@ def save_xavatar(path: str | Path, motion: Motion, body: BodyModel) -> Path:
             f"{motion.source}: pose vectors are y-up and this motion is {motion.up}-up; save "
             "motion.to_y_up(body)."
         )
-    groups = pose_groups(SMPLX_TREE)
-    poses, notices = smplx_poses(motion)
-    parts = {"scale": np.ones((len(motion), 1)), "transl": motion.transl}
-    for name, joints in groups.items():
-        pose = poses[:, list(joints)]
-        if name.endswith("hand_pose"):
-            side = "left" if name.startswith("left") else "right"
-            parts[name] = relative_hands(pose, body, side)
-        else:
-            parts[name] = pose.reshape(len(motion), -1)
+    poses, notices = grouped_poses(motion, body)
+    parts = {"scale": np.ones((len(motion), 1)), "transl": motion.transl, **poses}
     betas = np.broadcast_to(motion.betas, (len(motion), len(motion.betas)))
     for name, values in (("betas", betas), ("expression", np.asarray(motion.expression))):
         parts[name], notice = fit_size(values, _COEFFICIENTS, name, motion.source, "the format")
