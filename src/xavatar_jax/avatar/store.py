@@ -11,7 +11,7 @@ import equinox as eqx
 from .._version import __version__
 from ..body import BodyModel, load_body, synthetic_body
 from ..fields import HashGeometry
-from ..files import flatten_named, load_arrays, save_arrays, unflatten_named
+from ..files import flatten_named, load_arrays, refuse_newer, save_arrays, unflatten_named
 from ..training import (
     AvatarFields,
     config_from_dict,
@@ -62,11 +62,7 @@ def load_avatar(path: str | os.PathLike[str], *, body: BodyModel | None = None) 
     arrays, header = load_arrays(path)
     if header.get("kind") != "avatar":
         raise ValueError(f"{os.fspath(path)}: not an avatar file")
-    if header["format"] > _FORMAT:
-        raise ValueError(
-            f"{os.fspath(path)}: written by xavatar_jax {header['version']} in format "
-            f"{header['format']}; this version ({__version__}) reads up to {_FORMAT}"
-        )
+    refuse_newer(path, header, _FORMAT, written_by=header["version"])
     known = header["body"]
     body = _find_body(path, known) if body is None else body
     if body.source.checksum != known["checksum"]:

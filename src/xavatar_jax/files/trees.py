@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._version import __version__
 from .atomic import atomic_path
 from .unpickle import load_npz
 
@@ -36,6 +37,17 @@ def load_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
         raise ValueError(f"{os.fspath(path)}: no {_HEADER} inside, so it is not one of our files")
     header = json.loads(bytes(entries.pop(_HEADER)).decode())
     return entries, header
+
+
+def refuse_newer(
+    path: str | os.PathLike[str], header: Mapping[str, Any], known: int, *, written_by: str
+) -> None:
+    """**Raises:** `ValueError` if the header's `format` is above `known`, the newest we read."""
+    if header["format"] > known:
+        raise ValueError(
+            f"{os.fspath(path)}: written by xavatar_jax {written_by} in format "
+            f"{header['format']}; this version ({__version__}) reads up to {known}"
+        )
 
 
 def flatten_named(tree: Any) -> dict[str, Any]:

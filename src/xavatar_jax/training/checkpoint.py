@@ -17,7 +17,7 @@ import numpy as np
 
 from .._version import __version__
 from ..body import BodyModel, BodyParams
-from ..files import flatten_named, load_arrays, save_arrays, unflatten_named
+from ..files import flatten_named, load_arrays, refuse_newer, save_arrays, unflatten_named
 from .check import TrainingNotice
 from .config import FitConfig, config_from_dict, config_to_dict
 from .history import History
@@ -147,11 +147,7 @@ def load_checkpoint(path: str | os.PathLike[str], identity: RunIdentity) -> Chec
     arrays, header = load_arrays(path)
     if header.get("kind") != "checkpoint":
         raise ValueError(f"{name}: not a checkpoint, but {header.get('kind', 'something else')}")
-    if header["format"] > _FORMAT:
-        raise ValueError(
-            f"{name}: written by xavatar_jax {header['versions']['xavatar_jax']} in format "
-            f"{header['format']}; this version ({__version__}) reads up to {_FORMAT}"
-        )
+    refuse_newer(path, header, _FORMAT, written_by=header["versions"]["xavatar_jax"])
     run = header["run"]
     for part, found, wanted in (
         ("body", run["body"], identity.body),
