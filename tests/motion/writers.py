@@ -40,7 +40,7 @@ def joblib_names():
 def joblib_dump(path: Path, value, *, protocol: int = 4, compress: bool = False) -> Path:
     """A pickle with a record in the place of each array and the array's bytes behind it."""
     with joblib_names() as wrapper, open(path, "wb") as file:
-
+        # The pickler in Python: its `save` can be replaced. Stubs leave it out.
         class Pickler(pickle._Pickler):  # type: ignore[name-defined]
             def save(self, obj, save_persistent_id=True):
                 if type(obj) is not np.ndarray:
