@@ -9,12 +9,28 @@ from helpers import COLUMNS, PARENTS, toy_arrays
 
 from xavatar_jax.body import load_body, synthetic_body
 
+# Folders whose files share a labelled pool or a learned avatar: most of a minute each to make.
+_TOGETHER = ("training", "avatar")
 
-@pytest.fixture(scope="session", autouse=True)
-def compile_once(tmp_path_factory):
-    """What was compiled once in a run is not compiled again: many tests share programs."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+def pytest_collection_modifyitems(items):
+    """With several workers, a file stays on one, and so do the long folders, which begin."""
+
+    def place(item):
+        folder = item.path.parent.name
+        return _TOGETHER.index(folder) if folder in _TOGETHER else len(_TOGETHER)
+
+    items.sort(key=place)
+    for item in items:
+        together = item.path.parent if item.path.parent.name in _TOGETHER else item.path
+        item.add_marker(pytest.mark.xdist_group(str(together)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def free_programs():
+    """Compiled programs are dropped after each file: thousands of them fill a process's maps."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 from small_runs import posed_frames, tiny
 
 import xavatar_jax as xa
-from xavatar_jax.training import fresh_fields, loop
+from xavatar_jax.training import fresh_fields, loop, step
 from xavatar_jax.training.pool import find_roots, label_frames
 from xavatar_jax.training.progress import progress
 
@@ -32,3 +33,15 @@ def no_prefit(case):
         patch.setattr(loop, "initial_fields", lambda *_, **__: fields)
         patch.setattr(loop, "settle_on_person", lambda *_: fields)
         yield
+
+
+@pytest.fixture
+def other_objective(monkeypatch):
+    """Replaces the objective of geometry, in programs compiled before as well."""
+
+    def replace(objective):
+        monkeypatch.setattr(step, "geometry_objective", objective)
+        jax.clear_caches()
+
+    yield replace
+    jax.clear_caches()

@@ -206,10 +206,10 @@ def spoilt_at(step, seed):
     return spoilt
 
 
-def test_a_loss_that_is_not_finite_keeps_the_last_good_state(job, whole, tmp_path, monkeypatch):
+def test_a_loss_that_is_not_finite_keeps_the_last_good_state(job, whole, tmp_path, other_objective):
     """In the seventh step: the state kept is that after six."""
     call, _, config = job
-    monkeypatch.setattr(step_module, "geometry_objective", spoilt_at(6, config.seed))
+    other_objective(spoilt_at(6, config.seed))
     path = tmp_path / "run.npz"
     with pytest.raises(TrainingError, match=r"occupancy term is nan at step 7.*run\.npz") as error:
         call(checkpoint=path)
@@ -227,7 +227,7 @@ def test_a_loss_that_is_not_finite_keeps_the_last_good_state(job, whole, tmp_pat
         np.testing.assert_allclose(value, good[name], rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-def test_an_infinite_gradient_of_a_finite_loss_is_named(case, monkeypatch):
+def test_an_infinite_gradient_of_a_finite_loss_is_named(case, other_objective):
     body, _, config, fields, pool = case
     objective = step_module.geometry_objective
 
@@ -236,7 +236,7 @@ def test_an_infinite_gradient_of_a_finite_loss_is_named(case, monkeypatch):
         # The root of zero: its value is zero, its slope is infinite.
         return total + jnp.sqrt(0.0 * fields.geometry.biases[0].sum()), terms
 
-    monkeypatch.setattr(step_module, "geometry_objective", steep)
+    other_objective(steep)
     with pytest.raises(TrainingError, match="gradient term is nan at step 1"):
         train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
 

@@ -41,12 +41,15 @@ def template_weights(
 
     `vertices` are the body's in the canonical pose, of any shape.
     """
+    from scipy.sparse import csr_array
+
     faces = np.asarray(body.faces)
     _, face, position = closest_points(vertices, faces, points)
-    corners = vertices[faces[face]]
-    share = _barycentric(position, corners)
-    weights = np.asarray(body.weights, np.float64)
-    return np.einsum("nc,ncj->nj", share, weights[faces[face]])
+    corners = faces[face]
+    share = _barycentric(position, vertices[corners])
+    ends = np.arange(0, 3 * len(points) + 1, 3)
+    carry = csr_array((share.ravel(), corners.ravel(), ends), (len(points), len(vertices)))
+    return carry @ np.asarray(body.weights, np.float64)
 
 
 def template_grid_skinning(
@@ -81,23 +84,25 @@ def _smooth_away_from_surface(
     vertices: np.ndarray, grids: PartGrids, weights: np.ndarray, steps: int
 ) -> np.ndarray:
     """Average with neighbours of the same grid; nodes of cells that the surface crosses stay."""
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_array
 
-    cells = np.unique(np.asarray(grids.cells), axis=0)
-    # The twelve edges of a cell: corners that differ in one bit.
-    edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
-    rows = np.concatenate([cells[:, a] for a, b in edges] + [cells[:, b] for a, b in edges])
-    columns = np.concatenate([cells[:, b] for a, b in edges] + [cells[:, a] for a, b in edges])
-    links = coo_matrix((np.ones(len(rows), np.float32), (rows, columns)), (len(weights),) * 2)
-    links = links.tocsr()
-    links.data[:] = 1  # shared edges were counted once a cell
-    mean = links.multiply(1 / np.maximum(np.asarray(links.sum(1)), 1)).tocsr()
     cell, _, _ = grids.locate(jnp.asarray(vertices, jnp.float32))
     fixed = np.zeros(len(weights), bool)
     fixed[np.asarray(grids.cells)[np.asarray(cell)].ravel()] = True
+    free = np.flatnonzero(~fixed)
+
+    cells = np.unique(np.asarray(grids.cells), axis=0)
+    # The twelve edges of a cell: corners that differ in one bit.
+    edges = np.array([(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit])
+    pairs = cells[:, np.concatenate([edges, edges[:, ::-1]])].reshape(-1, 2)
+    links = coo_array((np.ones(len(pairs), np.float32), pairs.T), (len(weights),) * 2).tocsr()
+    links.data[:] = 1  # shared edges were counted once a cell
+    links = links[free]
+    degree = np.diff(links.indptr)
+    links.data /= np.repeat(np.maximum(degree, 1), degree).astype(np.float32)
     smooth = weights.astype(np.float32)
     for _ in range(steps):
-        smooth = np.where(fixed[:, None], weights, mean @ smooth)
+        smooth[free] = links @ smooth
     return smooth
 
 

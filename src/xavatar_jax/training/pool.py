@@ -85,7 +85,7 @@ def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any
         bar.update(1)
     check.notify()
     params = centred(frames.params)
-    transforms = eqx.filter_jit(jax.vmap(lambda p: bone_transforms(body, p)))(params)
+    transforms = _bone_transforms(body, params)
     shape = (len(points), len(points[0]))
     return FramePool(
         points=jnp.asarray(np.stack(points)),
@@ -101,6 +101,15 @@ def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any
     )
 
 
+# Here and below: made once, so that a second run, or the next polish, does not compile again.
+@eqx.filter_jit
+def _bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "T J 4 4"]:
+    return jax.vmap(lambda p: bone_transforms(body, p))(params)
+
+
+_tabulate = eqx.filter_jit(tabulate)
+
+
 def tabulate_for_search(
     body: BodyModel, betas: Any, skinning: AbstractSkinningField, config: FitConfig
 ) -> TabulatedSkinning:
@@ -110,7 +119,7 @@ def tabulate_for_search(
     else:
         vertices = np.asarray(canonical_vertices(body, jnp.asarray(betas)), np.float64)
         grids = body_part_grids(body, vertices, config.search.grid)
-    return eqx.filter_jit(tabulate)(skinning, grids)
+    return _tabulate(skinning, grids)
 
 
 def find_roots(
@@ -136,7 +145,6 @@ def find_roots(
     return _ordered(pool, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
 
 
-# Here and below: made once, so that a second run, or the next polish, does not compile again.
 @eqx.filter_jit
 def _search_frame(
     table: TabulatedSkinning,

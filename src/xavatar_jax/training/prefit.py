@@ -74,48 +74,53 @@ def _fit_mean_shape(
     points, distance, weights = _mean_shape_points(body, config)
     params = BodyParams.zeros(body)
     learned, fixed = eqx.partition(fields, _prefit_filter(fields, config))
-    network = "mlp" in (config.skinning.kind, config.geometry.kind)
-    batch = _NETWORK_BATCH if network else _BATCH
-    rate = optax.cosine_decay_schedule(
-        config.optimiser.learning_rate, max(config.prefit_steps, 1), alpha=0.05
-    )
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(config.optimiser.clip),
-        optax.adam(rate, eps=config.optimiser.epsilon),
-    )
     fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
-
-    @eqx.filter_jit
-    def step(learned: Any, state: Any, k: Array, data: Any, fixed_arrays: Any) -> Any:
-        points, distance, weights = data
-        key = jax.random.fold_in(jax.random.key(config.seed), k)
-        rows = jax.random.randint(key, (batch,), 0, len(points))
-
-        def loss(learned: AvatarFields) -> Array:
-            fields = eqx.combine(learned, fixed_arrays, static)
-            condition = fields.geometry.condition(params)
-            logit = jax.vmap(lambda x: fields.geometry(x, condition))(points[rows])
-            target = soft_occupancy(distance[rows], config.losses.softness)
-            total = binary_cross_entropy(logit, target).mean()
-            if weights is not None:
-                found = jax.vmap(fields.skinning)(points[rows])
-                # Cross-entropy: unlike a squared error it still pulls where a weight is near zero.
-                total = total - (weights[rows] * jnp.log(found + 1e-6)).sum(-1).mean()
-            return total
-
-        value, gradient = jax.value_and_grad(loss)(learned)
-        updates, state = optimiser.update(gradient, state, learned)
-        return eqx.apply_updates(learned, updates), state, value
-
-    state = optimiser.init(eqx.filter(learned, eqx.is_inexact_array))
-    data = (points, distance, weights)
+    state = _optimiser(config).init(eqx.filter(learned, eqx.is_inexact_array))
+    constant = (points, distance, weights, params, fixed_arrays)
     with progress("mean shape", config.prefit_steps, verbose=verbose) as bar:
         for k in range(config.prefit_steps):
-            learned, state, value = step(learned, state, jnp.asarray(k), data, fixed_arrays)
+            learned, state, value = _step(learned, state, jnp.asarray(k), constant, static, config)
             if k % 25 == 0:
                 bar.set_postfix(loss=f"{float(value):.4f}")
             bar.update(1)
     return eqx.combine(learned, fixed)
+
+
+def _optimiser(config: FitConfig) -> optax.GradientTransformation:
+    rate = optax.cosine_decay_schedule(
+        config.optimiser.learning_rate, max(config.prefit_steps, 1), alpha=0.05
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(config.optimiser.clip),
+        optax.adam(rate, eps=config.optimiser.epsilon),
+    )
+
+
+@eqx.filter_jit
+def _step(
+    learned: AvatarFields, state: Any, k: Array, constant: Any, static: Any, config: FitConfig
+) -> tuple[AvatarFields, Any, Array]:
+    points, distance, weights, params, fixed_arrays = constant
+    network = "mlp" in (config.skinning.kind, config.geometry.kind)
+    batch = _NETWORK_BATCH if network else _BATCH
+    key = jax.random.fold_in(jax.random.key(config.seed), k)
+    rows = jax.random.randint(key, (batch,), 0, len(points))
+
+    def loss(learned: AvatarFields) -> Array:
+        fields = eqx.combine(learned, fixed_arrays, static)
+        condition = fields.geometry.condition(params)
+        logit = jax.vmap(lambda x: fields.geometry(x, condition))(points[rows])
+        target = soft_occupancy(distance[rows], config.losses.softness)
+        total = binary_cross_entropy(logit, target).mean()
+        if weights is not None:
+            found = jax.vmap(fields.skinning)(points[rows])
+            # Cross-entropy: unlike a squared error it still pulls where a weight is near zero.
+            total = total - (weights[rows] * jnp.log(found + 1e-6)).sum(-1).mean()
+        return total
+
+    value, gradient = jax.value_and_grad(loss)(learned)
+    updates, state = _optimiser(config).update(gradient, state, learned)
+    return eqx.apply_updates(learned, updates), state, value
 
 
 def _prefit_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:

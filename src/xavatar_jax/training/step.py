@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -127,36 +127,54 @@ def make_steps(
     learned, fixed = eqx.partition(fields, trainable_filter(fields, config))
     # A copy: a step gives its input state's memory to the next one.
     learned = jax.tree.map(jnp.copy, learned)
-    points = config.points_per_step
-    several = rows_with_several(pool, points)
-    rates = config.optimiser
-    plans: dict[str, tuple[Any, int, int, float, int]] = {}
-    if config.search.cached:
-        plans["geometry"] = (geometry_objective, points, several, rates.learning_rate, config.steps)
-        if config.skinning.learned:
-            count = min(config.skinning_points, points)
-            plans["skinning"] = (
-                skinning_objective,
-                count,
-                min(several, count),
-                rates.skinning_rate,
-                config.steps // config.skinning_every,
-            )
-    else:
-        plans["both"] = (
-            partial(full_objective, devices=devices),
-            points,
-            0,
-            rates.learning_rate,
-            config.steps,
+    # Frozen arrays are arguments, not constants: baked in, they would be folded at compile time.
+    fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
+    optimisers: dict[str, Any] = {}
+    steps: dict[str, Step] = {}
+
+    def bind(plan: _Plan) -> Step:
+        return lambda state, pool: _step(
+            (pool, anchors, fixed_arrays), state, static, plan, config, devices
         )
-    optimisers, steps = {}, {}
-    for name, (objective, count, many, rate, total) in plans.items():
-        optimiser = make_optimiser(config, rate, total)
-        optimisers[name] = optimiser.init(_own(learned, name))
-        draw = partial(draw_batch, config=config, points=count, several=many, held=held)
-        steps[name] = _make_step(name, objective, optimiser, fixed, anchors, config, draw, devices)
+
+    for plan in _plans(pool, config, held):
+        optimisers[plan.name] = plan.optimiser(config).init(_own(learned, plan.name))
+        steps[plan.name] = bind(plan)
     return TrainState(learned, optimisers, jnp.zeros((), jnp.int32)), steps
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a kind of step learns, and what it draws. Values alone, so that equal ones share code.
+
+    `points` a frame, `several` of them from those with many roots, none of the last `held` frames;
+    a learning `rate`, which falls over `total` steps of this kind.
+    """
+
+    name: str
+    points: int
+    several: int
+    held: int
+    rate: float
+    total: int
+
+    def optimiser(self, config: FitConfig) -> optax.GradientTransformation:
+        return make_optimiser(config, self.rate, self.total)
+
+
+def _plans(pool: FramePool, config: FitConfig, held: int) -> list[_Plan]:
+    rates, points = config.optimiser, config.points_per_step
+    if not config.search.cached:
+        return [_Plan("both", points, 0, held, rates.learning_rate, config.steps)]
+    several = rows_with_several(pool, points)
+    plans = [_Plan("geometry", points, several, held, rates.learning_rate, config.steps)]
+    if config.skinning.learned:
+        count = min(config.skinning_points, points)
+        total = config.steps // config.skinning_every
+        plans.append(
+            _Plan("skinning", count, min(several, count), held, rates.skinning_rate, total)
+        )
+    return plans
 
 
 def _own(learned: AvatarFields, name: str) -> Any:
@@ -170,54 +188,48 @@ def _with_own(learned: AvatarFields, name: str, own: Any) -> AvatarFields:
     return eqx.tree_at(lambda f: getattr(f, name), learned, own)
 
 
-def _make_step(
-    name: str,
-    objective: Callable[..., Any],
-    optimiser: optax.GradientTransformation,
-    fixed: AvatarFields,
-    anchors: Anchors,
+# Made once: a second run of the same shapes and options does not compile again.
+@eqx.filter_jit(donate="all-except-first")
+def _step(
+    constant: tuple[FramePool, Anchors, Any],
+    state: TrainState,
+    static: Any,
+    plan: _Plan,
     config: FitConfig,
-    draw: Callable[..., Batch],
     devices: Devices,
-) -> Step:
-    fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
-    share = config.optimiser.skinning_rate / config.optimiser.learning_rate
+) -> tuple[TrainState, dict[str, Array]]:
+    pool, anchors, fixed_arrays = constant
+    name = plan.name
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    batch_key, loss_key = jax.random.split(key)
+    batch = draw_batch(pool, config, plan.points, plan.several, batch_key, held=plan.held)
+    batch = devices.spread(batch)
 
-    # Frozen arrays are arguments, not constants: baked in, they would be folded at compile time.
-    @eqx.filter_jit(donate="all-except-first")
-    def step(
-        constant: tuple[FramePool, Anchors, Any], state: TrainState
-    ) -> tuple[TrainState, dict[str, Array]]:
-        pool, anchors, fixed_arrays = constant
-        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-        batch_key, loss_key = jax.random.split(key)
-        batch = devices.spread(draw(pool, key=batch_key))
-
-        def loss(own: Any) -> tuple[Array, dict[str, Array]]:
-            learned = _with_own(state.learned, name, own)
-            fields = eqx.combine(learned, fixed_arrays, static)
-            return objective(fields, batch, anchors, config, loss_key)
-
-        own = _own(state.learned, name)
-        (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
-        updates, optimiser_state = optimiser.update(gradient, state.optimisers[name], own)
+    def loss(own: Any) -> tuple[Array, dict[str, Array]]:
+        learned = _with_own(state.learned, name, own)
+        fields = eqx.combine(learned, fixed_arrays, static)
         if name == "both":
-            # One clip over all, as the paper has it, but a rate for each field.
-            updates = eqx.tree_at(
-                lambda u: u.skinning,
-                updates,
-                jax.tree.map(lambda leaf: share * leaf, updates.skinning),
-            )
-        learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
-        optimisers = {**state.optimisers, name: optimiser_state}
-        after = TrainState(learned, optimisers, state.step + 1)
-        size = optax.tree.norm(gradient)
-        good = jnp.isfinite(total) & jnp.isfinite(size)
-        after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)
-        prefix = "skinning_" if name == "skinning" else ""
-        return devices.whole(after), {f"{prefix}loss": total, f"{prefix}gradient": size, **terms}
+            return full_objective(fields, batch, anchors, config, loss_key, devices=devices)
+        objective = geometry_objective if name == "geometry" else skinning_objective
+        return objective(fields, batch, anchors, config, loss_key)
 
-    return lambda state, pool: step((pool, anchors, fixed_arrays), state)
+    own = _own(state.learned, name)
+    (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
+    updates, optimiser_state = plan.optimiser(config).update(gradient, state.optimisers[name], own)
+    if name == "both":
+        # One clip over all, as the paper has it, but a rate for each field.
+        share = config.optimiser.skinning_rate / config.optimiser.learning_rate
+        updates = eqx.tree_at(
+            lambda u: u.skinning, updates, jax.tree.map(lambda leaf: share * leaf, updates.skinning)
+        )
+    learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
+    optimisers = {**state.optimisers, name: optimiser_state}
+    after = TrainState(learned, optimisers, state.step + 1)
+    size = optax.tree.norm(gradient)
+    good = jnp.isfinite(total) & jnp.isfinite(size)
+    after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)
+    prefix = "skinning_" if name == "skinning" else ""
+    return devices.whole(after), {f"{prefix}loss": total, f"{prefix}gradient": size, **terms}
 
 
 def with_learned(fields: AvatarFields, state: TrainState) -> AvatarFields:

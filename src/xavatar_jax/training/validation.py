@@ -51,17 +51,25 @@ def make_validation(
     """
     count = min(config.validation.points, pool.points.shape[1])
     several = rows_with_several(pool, count) if config.search.cached else 0
+    return lambda fields, pool: _loss(fields, pool, anchors, config, held, count, several)
+
+
+@eqx.filter_jit
+def _loss(
+    fields: AvatarFields,
+    pool: FramePool,
+    anchors: Anchors,
+    config: FitConfig,
+    held: int,
+    count: int,
+    several: int,
+) -> Float[Array, ""]:
+    chosen = jnp.arange(pool.points.shape[0] - held, pool.points.shape[0])
+    several_key, single_key, key = jax.random.split(jax.random.key(_KEY), 3)
+    batch = batch_of(pool, chosen, count, several, several_key, single_key)
     objective = skinning_objective if config.search.cached else full_objective
     name = "skinning_occupancy" if config.search.cached else "occupancy"
-
-    @eqx.filter_jit
-    def loss(fields: AvatarFields, pool: FramePool, anchors: Anchors) -> Array:
-        chosen = jnp.arange(pool.points.shape[0] - held, pool.points.shape[0])
-        several_key, single_key, key = jax.random.split(jax.random.key(_KEY), 3)
-        batch = batch_of(pool, chosen, count, several, several_key, single_key)
-        return objective(fields, batch, anchors, config, key)[1][name]
-
-    return lambda fields, pool: loss(fields, pool, anchors)
+    return objective(fields, batch, anchors, config, key)[1][name]
 
 
 @dataclass
