@@ -23,6 +23,10 @@ from .starts import StartTable, pull_back_all
 
 GRID_SOLVER = ClosedFormNewton(atol=1e-5, divergence=DIVERGENCE)
 FIELD_SOLVER = Broyden(atol=1e-5, divergence=DIVERGENCE)
+# What is searched on a guide is moved on afterwards: near is enough, and what ends at the edge of a
+# fold of one field may have a root in the other. Such places repeat, so more of them are kept.
+NEAR_SOLVER = ClosedFormNewton(atol=5e-4, divergence=DIVERGENCE)
+NEAR_MORE = 2
 # Starts of a point that have come this close, in metres, are on their way to one root.
 MERGE = 1e-3
 # Points searched at a time: bounds memory, and costs nothing above a few thousand.
@@ -87,15 +91,24 @@ def search_field(
     """Roots of any field, for points with part labels.
 
     Without a `guide`, by Broyden's method from the exact Jacobian at each start, one query of the
-    field a step. With a `guide`, the same field tabulated and posed, the search runs on that and
-    its few distinct roots are moved to the field's own by Newton's method: the residuals are the
-    field's, at a handful of queries a point. Other arguments are as for `search_grid`.
+    field a step. With a `guide`, the same field tabulated and posed, the search runs on that to
+    half a millimetre, and the few distinct places found are moved to the field's own roots by
+    Newton's method: the residuals are the field's, at a handful of queries a point. Other
+    arguments are as for `search_grid`.
     """
     if guide is not None:
         near = search_grid(
-            guide, x_d, parts, transforms, starts, keep=keep, merge=merge, chunk=chunk
+            guide,
+            x_d,
+            parts,
+            transforms,
+            starts,
+            solver=NEAR_SOLVER,
+            keep=keep + NEAR_MORE,
+            merge=merge,
+            chunk=chunk,
         )
-        return polish(field, near, x_d, transforms, atol=solver.atol, width=width)
+        return polish(field, near, x_d, transforms, keep=keep, atol=solver.atol, width=width)
 
     def residual(x: Array, target: Array) -> tuple[Array, None]:
         return skin_points(x, field(x), transforms) - target, None
@@ -123,13 +136,15 @@ def polish(
     x_d: Float[Array, "P 3"],
     transforms: Float[Array, "J 4 4"],
     *,
+    keep: int | None = None,
     atol: float = 1e-5,
     max_steps: int = 8,
     width: int = 2048,
 ) -> Roots:
     """Roots of a nearby field moved to those of this one, by Newton's method.
 
-    Those that do not get there are dropped, and two that become one count once.
+    Those that do not get there are dropped, and two that become one count once. At most `keep`
+    are returned a point (default: as many as were given).
     """
     solver = ClosedFormNewton(atol=atol, divergence=DIVERGENCE)
 
@@ -137,32 +152,31 @@ def polish(
         posed, jacobian, _ = skin_with_jacobian(field, x, transforms)
         return posed - target, jacobian
 
-    points, keep = roots.valid.shape
+    points, given = roots.valid.shape
     if not points:
-        return roots
+        return _no_roots(x_d, keep or given)
     solved = solve_lanes(
         solver,
         residual,
         roots.x_c.reshape(-1, 3),
-        jnp.repeat(x_d, keep, axis=0),
+        jnp.repeat(x_d, given, axis=0),
         roots.valid.reshape(-1),
         max_steps=max_steps,
         width=width,
     )
     valid = (solved.residual < atol) & jax.vmap(field.covers)(solved.y)
-    shaped = (points, keep)
-    x_c, error, valid, _ = distinct_roots(
-        solved.y.reshape(points, keep, 3),
+    shaped = (points, given)
+    x_c, error, valid, more = distinct_roots(
+        solved.y.reshape(points, given, 3),
         solved.residual.reshape(shaped),
         valid.reshape(shaped),
-        keep,
+        keep or given,
     )
     lost = (roots.outcome == Outcome.found) & ~jnp.any(valid, axis=1)
     where = jax.vmap(lambda gone, cause: Outcome.where(gone, Outcome.not_converged, cause))
     outcome = where(lost, roots.outcome)
-    return Roots(
-        x_c, valid, error, outcome, roots.more, roots.steps + jnp.sum(solved.steps), roots.lanes
-    )
+    steps = roots.steps + jnp.sum(solved.steps)
+    return Roots(x_c, valid, error, outcome, roots.more | more, steps, roots.lanes)
 
 
 def _search(
