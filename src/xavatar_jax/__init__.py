@@ -8,9 +8,11 @@ from .avatar import fit as fit
 from .avatar import load_avatar as load_avatar
 from .body import BodyModel as BodyModel
 from .body import BodyParams as BodyParams
+from .body import body_from_model as body_from_model
 from .body import bone_transforms as bone_transforms
 from .body import canonical_params as canonical_params
 from .body import load_body as load_body
+from .body import params_from_model as params_from_model
 from .body import pose_body as pose_body
 from .body import synthetic_body as synthetic_body
 from .correspondence import Broyden as Broyden

@@ -1,5 +1,7 @@
 """Body models of the SMPL family and any other tree: parameters, loading, posing."""
 
+from .adapter import body_from_model as body_from_model
+from .adapter import params_from_model as params_from_model
 from .hands import hands_to_absolute as hands_to_absolute
 from .hands import hands_to_relative as hands_to_relative
 from .joints import SMPL_TREE as SMPL_TREE
