@@ -33,6 +33,7 @@ TEXTS = (
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
 ANIMATE = "animate.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
+FLOOR = "metric_floor.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
 
@@ -315,12 +316,22 @@ def accuracy_of_gradients_view(record: dict[str, Any]) -> str:
 
 def float32_view(record: dict[str, Any]) -> str:
     """Derivatives in float32 beside those in float64."""
-    rows = [["roots", "by", "largest gap", "99 %", "median", "below 1e-3"]]
+    rows = [["roots", "by", "mode", "largest gap", "99 %", "median", "below 1e-3"]]
     for row in _of_table(record, "float32"):
         names = ("relative_gap_max", "relative_gap_p99", "relative_gap_median")
         gaps = (f"{row[name]:.1e}" for name in names)
-        rows.append([row["at"], row["by"], *gaps, f"{row['share_below_1e-3']:.4f}"])
+        mode = row.get("mode", "forward")
+        rows.append([row["at"], row["by"], mode, *gaps, f"{row['share_below_1e-3']:.4f}"])
     return _with_run(rows, record)
+
+
+def floor_view(record: dict[str, Any]) -> str:
+    """The truth against itself."""
+    rows = [["samples on either mesh", *(f"bounding-box IoU, {region}" for region in REGIONS)]]
+    for row in record["rows"]:
+        rows.append([str(row["samples"]), *(f"{row[f'iou_box_{region}']:.3f}" for region in REGIONS)])
+    header = record["header"]
+    return f"{_table(rows)}\n\n{_machine(header)}; {header['frames']} held-out frames."
 
 
 def time_of_gradients_view(record: dict[str, Any]) -> str:
@@ -393,6 +404,7 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{GRADIENTS} accuracy": accuracy_of_gradients_view,
     f"docs/figures/{GRADIENTS} float32": float32_view,
     f"docs/figures/{GRADIENTS} time": time_of_gradients_view,
+    f"docs/figures/{FLOOR}": floor_view,
 }
 _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
@@ -450,6 +462,7 @@ def main() -> None:
     parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
     parser.add_argument("--correspondence", help="JSON of benchmarks/correspondence.py")
     parser.add_argument("--gradients", help="JSON of benchmarks/gradients.py")
+    parser.add_argument("--metric-floor", help="JSON of benchmarks/metric_floor.py")
     args = parser.parse_args()
     if args.metrics:
         _store(args.metrics, METRICS, slim_metrics)
@@ -461,6 +474,8 @@ def main() -> None:
         _store(args.correspondence, SEARCH, slim_benchmark)
     if args.gradients:
         _store(args.gradients, GRADIENTS, slim_benchmark)
+    if args.metric_floor:
+        _store(args.metric_floor, FLOOR, slim_benchmark)
     for name in TEXTS:
         path = ROOT / name
         path.write_text(filled(path.read_text("utf-8")), encoding="utf-8")

@@ -1,0 +1,56 @@
+"""What the metrics say of a mesh that is exactly right: their floor and their ceiling.
+
+Question: both meshes of a comparison are sampled, each anew. What does the ground truth score
+against itself, with the 10,000 samples that the metrics take, and with more?
+
+    python benchmarks/metric_floor.py [--frames N] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+from search_problems import print_rows
+
+import xavatar_jax as xa
+from xavatar_jax.frames import spread
+from xavatar_jax.metrics import surface_metrics
+from xavatar_jax.report import describe_machine, write_json
+
+METRICS = {"cd_mm": "Chamfer", "nc": "normal consistency", "iou": "volume", "iou_box": "boxes"}
+REGIONS = ("all", "hands", "face")
+
+
+def floor_row(frames: xa.Frames, samples: int) -> dict[str, Any]:
+    """Means over frames of every metric of a mesh against itself."""
+    found: dict[str, list[float]] = {}
+    for frame in frames:
+        mesh = xa.Mesh(np.asarray(frame.vertices), np.asarray(frame.faces))
+        same = surface_metrics(mesh, mesh, labels=frame.part_labels, num_samples=samples)
+        for metric in METRICS:
+            for region in REGIONS:
+                value = getattr(getattr(same, metric), region)
+                found.setdefault(f"{metric}_{region}", []).append(float(value))
+    return {"samples": samples, **{name: float(np.mean(v)) for name, v in found.items()}}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Metrics of the ground truth against itself.")
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--json", help="write header and rows to this file")
+    parser.add_argument("--cache-dir")
+    args = parser.parse_args()
+    test = xa.synthetic_capture(args.cache_dir).test
+    frames = test[spread(test, args.frames)]
+    rows = [floor_row(frames, samples) for samples in (10_000, 100_000)]
+    print_rows(rows, tuple(rows[0]))
+    if args.json:
+        header = {"question": "metrics of the truth against itself", **describe_machine()}
+        write_json(args.json, {"header": {**header, "frames": args.frames}, "rows": rows})
+        print(f"written: {args.json}")
+
+
+if __name__ == "__main__":
+    main()
