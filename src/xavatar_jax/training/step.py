@@ -17,7 +17,14 @@ from .batch import Batch
 from .config import FitConfig
 from .devices import ONE_DEVICE, Devices
 from .model import AvatarFields, trainable_filter
-from .objective import Anchors, full_objective, geometry_objective, skinning_objective
+from .objective import (
+    Anchors,
+    ExtraTerms,
+    full_objective,
+    geometry_objective,
+    skinning_objective,
+    with_extra,
+)
 from .pool import FramePool
 
 
@@ -116,13 +123,14 @@ def make_steps(
     *,
     held: int = 0,
     devices: Devices = ONE_DEVICE,
+    terms: ExtraTerms | None = None,
 ) -> tuple[TrainState, dict[str, Step]]:
     """The first state, and the jitted steps `(state, pool) -> (state, terms)` by what they learn.
 
     With stored roots there is one for "geometry" and, if it is learned, one for "skinning"; with
-    roots searched in the step one for "both". Draws are keyed by seed and step number alone, and
-    leave out the pool's last `held` frames. A step whose loss or gradient is not finite changes
-    nothing.
+    roots searched in the step one for "both"; `terms` are added to each. Draws are keyed by seed
+    and step number alone, and leave out the pool's last `held` frames. A step whose loss or
+    gradient is not finite changes nothing.
     """
     learned, fixed = eqx.partition(fields, trainable_filter(fields, config))
     # A copy: a step gives its input state's memory to the next one.
@@ -154,6 +162,7 @@ def make_steps(
     for name, (objective, count, many, rate, total) in plans.items():
         optimiser = make_optimiser(config, rate, total)
         optimisers[name] = optimiser.init(_own(learned, name))
+        objective = with_extra(objective, terms or {}, "skinning_" if name == "skinning" else "")
         draw = partial(draw_batch, config=config, points=count, several=many, held=held)
         steps[name] = _make_step(name, objective, optimiser, fixed, anchors, config, draw, devices)
     return TrainState(learned, optimisers, jnp.zeros((), jnp.int32)), steps
