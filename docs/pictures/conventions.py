@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -41,34 +42,41 @@ def body_mesh(body: xa.BodyModel, params: xa.BodyParams, colors: np.ndarray | No
 
 def rod(start: np.ndarray, end: np.ndarray, radius: float, color: tuple, *, tip: bool) -> xa.Mesh:
     """A rod between two points, with an arrow's tip at its end if asked for."""
-    import trimesh
-
     length = float(np.linalg.norm(end - start))
-    head = 3.5 * radius if tip else 0.0
-    parts = [trimesh.creation.cylinder(radius, length - head, sections=24)]
-    parts[0].apply_translation([0, 0, 0.5 * (length - head)])
-    if tip:
-        cone = trimesh.creation.cone(2 * radius, head, sections=24)
-        cone.apply_translation([0, 0, length - head])
-        parts.append(cone)
-    turn = trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length)
-    pieces = [plain(part.apply_transform(turn).apply_translation(start), color) for part in parts]
+    along = (end - start) / length
+    across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    across /= np.linalg.norm(across)
+    sides, head = 24, 3.5 * radius if tip else 0.0
+    angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    ring = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.cross(along, across)
+    # Light is measured at vertices, and those at the ends may lie inside of something else.
+    stations = np.linspace(0, length - head, 24)
+    profile = [(1e-6, 0.0), *((radius, float(h)) for h in stations)]
+    profile += [(2 * radius, length - head)] if tip else []
+    profile += [(1e-6, length)]
+    # Every stretch has vertices of its own, so that edges stay sharp.
+    pieces = []
+    for (r0, h0), (r1, h1) in pairwise(profile):
+        vertices = np.concatenate([start + h * along + r * ring for r, h in ((r0, h0), (r1, h1))])
+        k, after = np.arange(sides), np.roll(np.arange(sides), -1)
+        lower = np.stack([k, after, after + sides], axis=1)
+        upper = np.stack([k, after + sides, k + sides], axis=1)
+        pieces.append(plain(vertices, np.concatenate([lower, upper]), color))
     return joined(pieces)
 
 
 def ball(centre: np.ndarray, radius: float, color: tuple) -> xa.Mesh:
+    """A ball."""
     import trimesh
 
-    return plain(
-        trimesh.creation.icosphere(subdivisions=2, radius=radius).apply_translation(centre), color
-    )
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    return plain(np.asarray(shape.vertices) + centre, np.asarray(shape.faces), color)
 
 
-def plain(shape, color: tuple) -> xa.Mesh:
-    """A shape of trimesh in one colour, with the normals of its vertices."""
-    colors = np.tile(np.array(color, np.uint8), (len(shape.vertices), 1))
-    mesh = xa.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces))
-    return replace(mesh.compute_normals(), colors=colors)
+def plain(vertices: np.ndarray, faces: np.ndarray, color: tuple) -> xa.Mesh:
+    """A mesh in one colour."""
+    colors = np.tile(np.array(color, np.uint8), (len(vertices), 1))
+    return replace(xa.Mesh(vertices.astype(np.float32), faces).compute_normals(), colors=colors)
 
 
 def joined(meshes: Iterable[xa.Mesh]) -> xa.Mesh:
@@ -84,7 +92,7 @@ def joined(meshes: Iterable[xa.Mesh]) -> xa.Mesh:
 
 
 def labelled(
-    picture: np.ndarray, camera: Camera, labels: dict[str, np.ndarray], size: int, shift=(6, -16)
+    picture: np.ndarray, camera: Camera, labels: dict[str, np.ndarray], size: int, shift=(12, -9)
 ) -> np.ndarray:
     """The picture with words beside points of the world."""
     height, width = picture.shape[:2]
@@ -109,7 +117,7 @@ def axes(body: xa.BodyModel) -> np.ndarray:
     mesh = joined([rest, *arrows])
     reach = np.concatenate([mesh.vertices, [origin + np.array([0.95, 0, 0.3])]])
     camera = frame_view(reach, "three_quarter", aspect=1.0, elevation=0.35)
-    return labelled(render_mesh(mesh, camera, 720, ground=True), camera, ends, 17)
+    return labelled(render_mesh(mesh, camera, 640, ground=True), camera, ends, 17)
 
 
 def skeleton(body: xa.BodyModel, joints: list[int], thick: float) -> xa.Mesh:
@@ -124,21 +132,23 @@ def skeleton(body: xa.BodyModel, joints: list[int], thick: float) -> xa.Mesh:
 
 
 def joint_pictures(body: xa.BodyModel) -> np.ndarray:
-    """Numbers of the joints: the body from the front, the left hand from above."""
+    """Numbers of the joints: the body from the front, the head from the left, the left hand."""
     tree, places = body.tree, np.asarray(rest_joints(body, jnp.zeros(0)))
+    trunk = list(range(22))
+    head = tree.indices("spine3", "neck", "left_collar", "head", "jaw", "left_eye", "right_eye")
     hand = [tree.index("left_wrist"), *range(25, 40)]
-    trunk = list(range(25))
-    size = 640
     views = [
         (trunk, 0.011, frame_view(places[trunk], "front", margin=1.12, elevation=0.0)),
+        (list(head), 0.005, part_view(places[list(head)], (1.0, 0.0, 0.5), margin=1.3)),
         (hand, 0.0022, part_view(places[hand], (0.0, 1.0, 0.05), margin=1.2)),
     ]
     pictures = []
     for joints, thick, camera in views:
-        picture = render_mesh(skeleton(body, joints, thick), camera, size)
+        picture = render_mesh(skeleton(body, joints, thick), camera, 520)
         names = {str(j): places[j] for j in joints}
-        pictures.append(labelled(picture, camera, names, 14, shift=(9, -18)))
-    return grid_picture([pictures], column_labels=["body, jaw and eyes, front", "left hand, above"])
+        pictures.append(labelled(picture, camera, names, 14, shift=(8, -25)))
+    labels = ["body, from the front", "head, from the left", "left hand, from above"]
+    return grid_picture([pictures], column_labels=labels)
 
 
 def parts(body: xa.BodyModel) -> np.ndarray:
@@ -159,16 +169,13 @@ def poses(body: xa.BodyModel) -> np.ndarray:
     flat = xa.BodyParams.zeros(body)
     mean = xa.BodyParams.create(body, pose=body.hand_mean)
     meshes = [body_mesh(body, p, None) for p in (flat, xa.canonical_params(body))]
-    tall = (360, 480)
-    row = [
-        render_mesh(m, frame_view(meshes[0].vertices, "front", aspect=0.75, margin=1.12), tall)
-        for m in meshes
-    ]
+    camera = frame_view(np.concatenate([m.vertices for m in meshes]), "front")
+    row = [render_mesh(mesh, camera, 380) for mesh in meshes]
     hand = np.isin(np.asarray(body.part_labels), LEFT_HAND)
     for params in (flat, mean):
         mesh = body_mesh(body, params, None)
-        camera = part_view(mesh.vertices[hand], (0.3, 0.8, 0.9), aspect=0.75, margin=1.2)
-        row.append(render_mesh(mesh, camera, tall))
+        camera = part_view(mesh.vertices[hand], (0.3, 0.8, 0.9), margin=1.2)
+        row.append(render_mesh(mesh, camera, 380))
     names = ["rest pose: all zero", "canonical pose", "zero: the flat hand", "the mean hand"]
     return grid_picture([row], column_labels=names)
 

@@ -16,7 +16,6 @@ from typing import Any
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
-from mkdocs.structure.nav import Navigation, Section
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,6 +35,15 @@ FILES = (
 )
 _LINK = re.compile(r"(!?\[[^\]]*\]\()([^)\s#]+)(#[^)\s]*)?\)")
 _CODE = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """List the reference's pages under its first one."""
+    for item in config.nav or []:
+        if "Reference" in item:
+            pages = sorted(name for name in reference_pages() if name != "api/index.md")
+            item["Reference"] = ["api/index.md", *pages]
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -93,22 +101,6 @@ def _place(path: str) -> str:
     return path.removeprefix("docs/")
 
 
-def on_nav(nav: Navigation, *, config: MkDocsConfig, files: Files) -> Navigation:
-    """List the reference's pages under its first one."""
-    for item in nav.items:
-        if isinstance(item, Section) and item.title == "Reference":
-            for name in public_names():
-                if name == "xavatar_jax":
-                    continue
-                file = files.get_file_from_path(f"api/{name.split('.')[1]}.md")
-                assert file is not None
-                page = file.page or Page(name.split(".")[1], file, config)
-                page.parent = item
-                item.children.append(page)
-                nav.pages.append(page)
-    return nav
-
-
 def public_names() -> dict[str, dict[str, str]]:
     """Public names of the package and of each subpackage, by the module that has them.
 
@@ -128,6 +120,19 @@ def public_names() -> dict[str, dict[str, str]]:
     return found
 
 
+def first_sentence(module: str, name: str) -> str:
+    """How the docstring of a function or class begins, read without importing anything."""
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name:
+            text = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
+            return re.split(r"(?<=\w)[.;:] ", text)[0].rstrip(".").replace("|", "\\|") + "."
+        if isinstance(node, ast.ImportFrom) and any(a.name == name for a in node.names):
+            return first_sentence(f"{module}.{node.module}", name)
+    return ""
+
+
 def reference_pages() -> dict[str, str]:
     """Markdown of the reference: a page for each subpackage, and one that leads to them."""
     every = public_names()
@@ -139,13 +144,14 @@ def reference_pages() -> dict[str, str]:
         "Every public name, from its docstring. `import xavatar_jax as xa` has those of the first",
         "table; the rest are imported from their package.",
         "",
-        "| Name | Package |",
-        "|---|---|",
+        "| Name | Package | What it is |",
+        "|---|---|---|",
     ]
     for name, module in sorted(front.items(), key=lambda item: item[0].lower()):
         package = module.removeprefix("xavatar_jax.").split(".")[0]
-        target = f"xavatar_jax.{package}.{name}"
-        lines.append(f"| [`xa.{name}`][{target}] | [`{package}`]({package}.md) |")
+        target = f"{every[f'xavatar_jax.{package}'][name]}.{name}"
+        what = first_sentence(*target.rsplit(".", 1))
+        lines.append(f"| [`xa.{name}`][{target}] | [`{package}`]({package}.md) | {what} |")
     lines += ["", "| Package | What it holds |", "|---|---|"]
     for dotted, names in every.items():
         package = dotted.split(".")[1]
@@ -156,7 +162,8 @@ def reference_pages() -> dict[str, str]:
         if names:
             some = ", ".join(sorted(names, key=str.lower)[:2])
             body += ["```python", f"from {dotted} import {some}", "```", ""]
-        body += [f"::: {dotted}.{name}\n" for name in sorted(names, key=str.lower)]
+        # By the module that defines it: `avatar.fit` is a module as well as a function.
+        body += [f"::: {names[name]}.{name}\n" for name in sorted(names, key=str.lower)]
         pages[f"api/{package}.md"] = "\n".join(body)
     pages["api/index.md"] = "\n".join(lines) + "\n"
     return pages
