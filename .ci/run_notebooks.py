@@ -35,8 +35,6 @@ def main() -> None:
             kernel_name="python3",
             resources={"metadata": {"path": str(folder)}},
         )
-        client.create_kernel_manager()
-        client.km.transport = "ipc"  # over TCP every kernel warns of eavesdroppers
         try:
             client.execute()
         except CellExecutionError as error:

@@ -129,7 +129,9 @@ def first_sentence(module: str, name: str) -> str:
             text = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
             return re.split(r"(?<=\w)[.;:] ", text)[0].rstrip(".").replace("|", "\\|") + "."
         if isinstance(node, ast.ImportFrom) and any(a.name == name for a in node.names):
-            return first_sentence(f"{module}.{node.module}", name)
+            above = node.level - path.is_dir()  # packages to climb from this module
+            base = module.split(".")[: len(module.split(".")) - above]
+            return first_sentence(".".join([*base, node.module or ""]), name)
     return ""
 
 
