@@ -5,8 +5,11 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import inspect
 import json
 import re
+import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +29,9 @@ PAGES = sorted(
     ]
 )
 SCRIPTS = sorted([*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")])
+
+# Pages whose blocks of code build on those before them, and are run.
+RUN_IN_ORDER = ("derivations.md", "extending.md")
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 
@@ -102,14 +108,18 @@ def test_named_parts_of_the_library_exist(page):
 def test_named_modules_exist(page):
     for dotted in set(re.findall(r"`(xavatar_jax(?:\.\w+)+)`", read(page))):
         parent, _, name = dotted.rpartition(".")
-        assert hasattr(importlib.import_module(parent), name), dotted
+        is_module = importlib.util.find_spec(parent) and importlib.util.find_spec(dotted)
+        assert is_module or hasattr(importlib.import_module(parent), name), dotted
 
 
 @each_page
 def test_python_blocks_parse_and_import_what_they_use(page):
+    imported: set[str] = set()
     for block in blocks(page, "python"):
         tree = ast.parse(block)
-        imported = {
+        # Blocks of most pages stand for themselves.
+        imported = imported if page.name in RUN_IN_ORDER else set()
+        imported |= {
             alias.asname or alias.name.split(".")[0]
             for node in ast.walk(tree)
             if isinstance(node, ast.Import)
@@ -261,6 +271,133 @@ def test_kept_figures_name_no_path(file):
                 yield from strings(item)
 
     assert not [s for s in strings(json.loads(read(file))) if "/" in s and "points/s" not in s]
+
+
+@pytest.mark.parametrize("name", RUN_IN_ORDER)
+def test_code_of_pages_that_build_on_themselves_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for k, block in enumerate(blocks(ROOT / "docs" / name, "python")):
+        exec(compile(block, f"{name}, block {k + 1}", "exec"), names)
+
+
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def cells(notebook: Path, kind: str) -> list[str]:
+    document = json.loads(read(notebook))
+    return ["".join(c["source"]) for c in document["cells"] if c["cell_type"] == kind]
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebooks_are_small_and_use_public_names_only(notebook):
+    assert notebook.stat().st_size < 30_000
+    document = json.loads(read(notebook))
+    assert document["nbformat"] == 4
+    assert not [c for c in document["cells"] if c.get("outputs") or c.get("execution_count")]
+    tree = ast.parse("\n".join(cells(notebook, "code")))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "xa":
+            assert node.attr in PUBLIC["xavatar_jax"], node.attr
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("xavatar_jax"):
+            assert {a.name for a in node.names} <= PUBLIC[str(node.module)], node.module
+    for target in re.findall(r"\]\(([^)]+)\)", "\n".join(cells(notebook, "markdown"))):
+        assert (notebook.parent / target).exists(), target
+
+
+def test_notebooks_are_listed_and_run():
+    page, runner = (read(ROOT / p) for p in ("docs/notebooks.md", ".ci/run_notebooks.py"))
+    for notebook in NOTEBOOKS:
+        assert f"(../notebooks/{notebook.name})" in page
+        assert f'"{notebook.stem}"' in runner
+
+
+def public_names() -> dict[str, set[str]]:
+    """What the package and each subpackage import `as` themselves."""
+    source = ROOT / "src" / "xavatar_jax"
+    found = {}
+    for file in [source / "__init__.py", *sorted(source.glob("*/__init__.py"))]:
+        dotted = ".".join(file.parent.relative_to(source.parent).parts)
+        aliases = [
+            alias.name
+            for node in ast.parse(read(file)).body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+            if alias.asname == alias.name and not alias.name.startswith("_")
+        ]
+        found[dotted] = set(aliases)
+    return found
+
+
+PUBLIC = public_names()
+
+
+def constant_docstrings(package: str) -> set[str]:
+    """Names of a package's modules that a string stands below: how a constant is documented."""
+    folder = Path(str(sys.modules[package].__file__)).parent
+    found = set()
+    for file in folder.glob("*.py"):
+        body = ast.parse(read(file)).body
+        for node, after in pairwise(body):
+            target = node.targets[0] if isinstance(node, ast.Assign) else None
+            target = node.target if isinstance(node, ast.AnnAssign) else target
+            text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            if isinstance(target, ast.Name) and text:
+                found.add(target.id)
+    return found
+
+
+@pytest.mark.parametrize("package", [p for p in PUBLIC if p != "xavatar_jax"])
+def test_every_public_name_has_a_docstring(package):
+    module = importlib.import_module(package)
+    assert (module.__doc__ or "").strip()
+    constants = constant_docstrings(package)
+    missing = []
+    for name in sorted(PUBLIC[package]):
+        value = getattr(module, name)
+        if inspect.isfunction(value):
+            missing += [] if value.__doc__ else [name]
+        elif inspect.isclass(value):
+            # A dataclass without a text of its own gets its signature for one.
+            own = value.__doc__ and not value.__doc__.startswith(f"{name}(")
+            missing += [] if own else [name]
+            missing += [f"{name}.{member}" for member in _undocumented_members(value)]
+        elif not (hasattr(value, "__wrapped__") and value.__doc__):
+            missing += [] if name in constants else [name]
+    assert not missing
+
+
+def _undocumented_members(kind: type) -> list[str]:
+    """Public methods and properties that neither the class nor what it inherits describes."""
+    found = []
+    for name, member in vars(kind).items():
+        function = getattr(member, "fget", None) or getattr(member, "func", None) or member
+        function = getattr(function, "__func__", function)
+        written_here = inspect.isfunction(function) and function.__module__ == kind.__module__
+        if not name.startswith("_") and written_here and not inspect.getdoc(getattr(kind, name)):
+            found.append(name)
+    return found
+
+
+def test_the_front_has_only_names_that_the_reference_has():
+    elsewhere = set().union(*(names for p, names in PUBLIC.items() if p != "xavatar_jax"))
+    assert PUBLIC["xavatar_jax"] <= elsewhere
+
+
+def test_the_site_lists_every_page():
+    listed = set(re.findall(r"[\w/-]+\.md\b", read(ROOT / "mkdocs.yml").split("\nnav:", 1)[1]))
+    pages = {p.name for p in (ROOT / "docs").glob("*.md")}
+    made = {"readme.md", "changelog.md", "contributing.md", "third-party-notices.md"}
+    assert listed == pages | made | {"api/index.md"}
+
+
+def test_runner_of_commands_knows_no_command_that_is_gone():
+    spec = importlib.util.spec_from_file_location("commands", ROOT / ".ci" / "run_commands.py")
+    assert spec is not None
+    assert spec.loader is not None
+    runner = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(runner)
+    assert not sorted(set(runner.HOW) - set(runner.commands()))
 
 
 def test_version_stands_the_same_everywhere():

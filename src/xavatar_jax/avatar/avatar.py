@@ -49,6 +49,7 @@ class CellSizes:
     hands: float = 0.002
 
     def scaled(self, factor: float) -> CellSizes:
+        """All sizes times `factor`."""
         return CellSizes(*(factor * v for v in (self.body, self.head, self.face, self.hands)))
 
 

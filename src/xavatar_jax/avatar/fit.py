@@ -10,7 +10,9 @@ from typing import Any
 from ..body import BodyModel
 from ..frames import Frames
 from ..training import (
+    AvatarFields,
     Callback,
+    ExtraTerms,
     FitConfig,
     Fitted,
     History,
@@ -51,6 +53,8 @@ def fit(
     resume: bool = False,
     log: str | os.PathLike[str] | None = None,
     devices: Sequence[Any] | None = None,
+    fields: AvatarFields | None = None,
+    terms: ExtraTerms | None = None,
 ) -> Fit:
     """Learn an avatar of the person in `frames`.
 
@@ -69,6 +73,13 @@ def fit(
       training is stopped; `resume=True` goes on from it, with the numbers of an uninterrupted
       run on the same machine.
     - `devices` share each step: all that JAX sees, unless given.
+
+    What is learned may be of one's own making, and is then to be given again to `resume`:
+
+    - `fields`: to begin with, in place of those that the config describes and the mean shape
+      gives; of any class, in the canonical space of the person.
+    - `terms`: more terms of the loss, `{name: (weight, term)}` with
+      `term(fields, batch, key) -> number`.
 
     **Raises:** `ValueError` naming the frame for parameters or meshes that cannot be used, or
     what differs for a checkpoint of another run; `TrainingError` if a loss is not finite, and
@@ -101,6 +112,8 @@ def fit(
             resume=resume,
             log=log,
             devices=devices,
+            fields=fields,
+            terms=terms,
         )
     except (TrainingError, Interrupted) as error:
         error.fitted = finished(error.fitted)

@@ -50,11 +50,17 @@ def save_avatar(avatar: Avatar, path: str | os.PathLike[str]) -> None:
     save_arrays(path, {"betas": avatar.betas, **arrays}, header)
 
 
-def load_avatar(path: str | os.PathLike[str], *, body: BodyModel | None = None) -> Avatar:
+def load_avatar(
+    path: str | os.PathLike[str],
+    *,
+    body: BodyModel | None = None,
+    fields: AvatarFields | None = None,
+) -> Avatar:
     """Read an avatar written by `Avatar.save`.
 
     Without `body` the model file it was learned on is loaded again; the bundled body is made anew
-    if need be.
+    if need be. `fields`, for an avatar with fields of one's own class: any of their structure,
+    whose learned arrays are replaced.
 
     **Raises:** `FileNotFoundError` if the body's file is gone, `ValueError` if the body given, or
     the file found, is another one, or if the avatar file is damaged or from a newer version.
@@ -73,7 +79,8 @@ def load_avatar(path: str | os.PathLike[str], *, body: BodyModel | None = None) 
         )
     config = config_from_dict(header["config"])
     betas = arrays.pop("betas")
-    fields = settle_on_person(body, fresh_fields(body, config), betas, config)
+    if fields is None:
+        fields = settle_on_person(body, fresh_fields(body, config), betas, config)
     avatar = Avatar(body, betas, fields, config, header["steps"])
     kept = unflatten_named(_kept(fields, avatar), arrays, source=os.fspath(path))
     return Avatar(body, betas, eqx.combine(kept, fields), config, header["steps"])

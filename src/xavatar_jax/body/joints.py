@@ -26,11 +26,14 @@ SMPLX_TREE = KinematicTree(
     (*_BODY, "jaw", "left_eye", "right_eye", *_hand_names("left"), *_hand_names("right")),
     (*_BODY_PARENTS, 15, 15, 15, *_hand_parents(20, 25), *_hand_parents(21, 40)),
 )
+"""The 55 joints of SMPL-X: body, jaw, eyes, two hands."""
 SMPLH_TREE = KinematicTree(
     (*_BODY, *_hand_names("left"), *_hand_names("right")),
     (*_BODY_PARENTS, *_hand_parents(20, 22), *_hand_parents(21, 37)),
 )
+"""The 52 joints of SMPL-H: body, two hands."""
 SMPL_TREE = KinematicTree((*_BODY, "left_hand", "right_hand"), (*_BODY_PARENTS, 20, 21))
+"""The 24 joints of SMPL: body, and one joint a hand."""
 
 
 def mano_tree(side: str) -> KinematicTree:

@@ -35,6 +35,7 @@ class BodySource:
     checksum: str
 
     def describe(self) -> str:
+        """Kind, gender and path, for messages."""
         return f"{self.kind}, {self.gender}, {self.path}"
 
 
@@ -64,22 +65,27 @@ class BodyModel(eqx.Module):
 
     @property
     def kind(self) -> str:
+        """One of "smplx", "smplh", "smpl", "mano" and "other"."""
         return self.source.kind
 
     @property
     def num_vertices(self) -> int:
+        """V, vertices of the template."""
         return self.template.shape[0]
 
     @property
     def num_joints(self) -> int:
+        """J, joints of the tree."""
         return self.tree.num_joints
 
     @property
     def num_betas(self) -> int:
+        """S, shape directions."""
         return self.shape_dirs.shape[-1]
 
     @property
     def num_expression(self) -> int:
+        """E, expression directions."""
         return self.expression_dirs.shape[-1]
 
 

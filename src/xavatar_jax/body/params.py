@@ -126,6 +126,7 @@ class BodyParams(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes; empty for one frame."""
         return self.pose.shape[:-2]
 
     def _view(self, name: str) -> Float[Array, "*batch n 3"]:
@@ -133,30 +134,37 @@ class BodyParams(eqx.Module):
 
     @property
     def global_orient(self) -> Float[Array, "*batch 3"]:
+        """Orientation of the root in the world."""
         return self.pose[..., 0, :]
 
     @property
     def body_pose(self) -> Float[Array, "*batch n 3"]:
+        """Rotations of all joints that belong to no other name, `(..., 21, 3)` in SMPL-X."""
         return self._view("body_pose")
 
     @property
     def left_hand_pose(self) -> Float[Array, "*batch n 3"]:
+        """Rotations of the left hand's joints, `(..., 15, 3)`."""
         return self._view("left_hand_pose")
 
     @property
     def right_hand_pose(self) -> Float[Array, "*batch n 3"]:
+        """Rotations of the right hand's joints, `(..., 15, 3)`."""
         return self._view("right_hand_pose")
 
     @property
     def jaw_pose(self) -> Float[Array, "*batch n 3"]:
+        """Rotation of the jaw, `(..., 1, 3)`."""
         return self._view("jaw_pose")
 
     @property
     def leye_pose(self) -> Float[Array, "*batch n 3"]:
+        """Rotation of the left eye, `(..., 1, 3)`."""
         return self._view("leye_pose")
 
     @property
     def reye_pose(self) -> Float[Array, "*batch n 3"]:
+        """Rotation of the right eye, `(..., 1, 3)`."""
         return self._view("reye_pose")
 
 

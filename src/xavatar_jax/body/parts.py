@@ -8,9 +8,21 @@ from jaxtyping import Float, Int8
 from ..kinematics import KinematicTree
 
 PARTS = ("body", "face", "left_hand", "right_hand", "eyes_mouth")
-BODY, FACE, LEFT_HAND, RIGHT_HAND, EYES_MOUTH = range(len(PARTS))
+"""Names of the parts; a part label is an index into them."""
+BODY = PARTS.index("body")
+"""Label of what is neither hand nor face."""
+FACE = PARTS.index("face")
+"""Label of the head without eyes and mouth."""
+LEFT_HAND = PARTS.index("left_hand")
+"""Label of the left hand, from the wrist."""
+RIGHT_HAND = PARTS.index("right_hand")
+"""Label of the right hand, from the wrist."""
+EYES_MOUTH = PARTS.index("eyes_mouth")
+"""Label of the eyes and the seam of the lips."""
 HANDS = (LEFT_HAND, RIGHT_HAND)
+"""Labels that count as hands."""
 FACES = (FACE, EYES_MOUTH)
+"""Labels that count as face."""
 
 
 def derive_part_labels(

@@ -17,6 +17,7 @@ from ..body import PARTS
 from ..kinematics import KinematicTree, inverse_3x3
 
 StartSet = Literal["part_aware", "paper", "body", "full"]
+"""Starts of a point: of its part (our own groups, or the paper's), of the body, or of all parts."""
 
 _LIMBS = (
     *("left_hip", "right_hip", "left_knee", "right_knee"),
@@ -31,8 +32,8 @@ def _pair_rows() -> Int[np.ndarray, "parts parts"]:
     return rows
 
 
-# Row of a start table made with pairs, for a point close to parts a and b.
 PAIR_ROWS = _pair_rows()
+"""Row of a start table made with pairs, for a point close to parts a and b: `PAIR_ROWS[a, b]`."""
 
 
 class Group(NamedTuple):
@@ -61,6 +62,7 @@ class StartTable(eqx.Module):
 
     @property
     def width(self) -> int:
+        """Starts a point, padding included."""
         return self.index.shape[1]
 
 

@@ -10,6 +10,7 @@ from ..meshing import Mesh
 from .meshes import write_obj, write_ply
 
 SequenceFormat = Literal["ply", "obj"]
+"""File formats of mesh sequences."""
 
 
 def write_sequence(

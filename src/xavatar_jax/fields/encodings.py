@@ -67,6 +67,7 @@ class HashEncoding(eqx.Module):
 
     @property
     def width(self) -> int:
+        """Features a point, of all levels together."""
         return len(self.spacing) * self.table.shape[1]
 
     def __call__(self, x: Float[Array, "3"]) -> Float[Array, "levels features"]:

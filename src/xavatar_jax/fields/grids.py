@@ -54,6 +54,7 @@ class PartGrids(eqx.Module):
 
     @property
     def num_nodes(self) -> int:
+        """N, nodes of all grids together."""
         return self.nodes.shape[0]
 
     def locate(self, x: Float[Array, "*p 3"]) -> tuple[Array, Array, Array]:

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 
 from ..kinematics import KinematicTree
 
-SOFT_BLEND = 20.0  # factor on raw network outputs in the released code
+SOFT_BLEND = 20.0
+"""Factor on a network's outputs before the softmax, as in X-Avatar's released code."""
 
 
 class _Layout(NamedTuple):

@@ -15,6 +15,7 @@ from .hierarchical import SOFT_BLEND, hierarchical_softmax, num_logits
 from .mlp import ImplicitMLP, MLPShape
 
 PAPER_SKINNING = MLPShape(width=128, depth=5, octaves=0, skip=(), condition_at=())
+"""The paper's skinning network: five layers of 128, points as they are."""
 
 
 class AbstractSkinningField(eqx.Module):

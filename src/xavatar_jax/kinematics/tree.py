@@ -36,6 +36,7 @@ class KinematicTree:
 
     @property
     def num_joints(self) -> int:
+        """J, joints of the tree."""
         return len(self.parents)
 
     @cached_property
@@ -56,6 +57,7 @@ class KinematicTree:
         )
 
     def children(self, joint: int) -> tuple[int, ...]:
+        """The joints whose parent this one is, in index order."""
         return self._children[joint]
 
     def subtree(self, joint: int) -> tuple[int, ...]:

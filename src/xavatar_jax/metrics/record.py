@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 REGIONS = ("all", "hands", "face")
+"""Parts of a body that every figure is given for."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ _SHORT = {
     "L_Collar": "left_collar", "L_Shoulder": "left_shoulder", "L_Elbow": "left_elbow",
     "L_Wrist": "left_wrist",
 }  # fmt: skip
-# Each map takes names of the file, without a prefix such as `mixamorig:`, to names of SMPL-X.
 JOINT_MAPS: dict[str, dict[str, str]] = {
     "smplx": {name: name for name in SMPLX_TREE.names},
     "mixamo": {
@@ -50,6 +49,7 @@ JOINT_MAPS: dict[str, dict[str, str]] = {
         **{"Neck": "neck", "Head": "head"},
     },
 }
+"""Names in a BVH file, without a prefix such as `mixamorig:`, to names of SMPL-X, by skeleton."""
 # Without these nothing can be said about where the person stands or what the limbs do.
 NEEDED = (
     "pelvis", "head", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle",

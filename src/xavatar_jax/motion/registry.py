@@ -31,6 +31,7 @@ FORMATS: dict[str, Format] = {
         *(amass, grab, xhumans, xavatar, pymafx, smplerx, phalp, easymocap, bvh, params),
     )
 }
+"""Motion formats that are read, by name, in the order in which they are tried."""
 WRITERS = ("amass", "bvh", "poses", "xavatar")
 _SUFFIXES = {".npz": "amass", ".bvh": "bvh", ".pkl": "poses", "": "poses", ".npy": "xavatar"}
 

@@ -39,9 +39,11 @@ class SamplingPlan:
 
     @property
     def total(self) -> int:
+        """Points a frame."""
         return self.body + self.face + self.eyes_mouth + 2 * self.hand + self.box
 
     def counts(self) -> dict[int, int]:
+        """Points by part label."""
         return {
             BODY: self.body,
             FACE: self.face,

@@ -1,5 +1,6 @@
 """Training: configs and presets, the objective, the jitted step, the loop."""
 
+from .batch import Batch as Batch
 from .check import TrainingNotice as TrainingNotice
 from .config import PRESETS as PRESETS
 from .config import FitConfig as FitConfig
@@ -25,6 +26,8 @@ from .model import as_dtype as as_dtype
 from .model import fresh_fields as fresh_fields
 from .model import settle_on_person as settle_on_person
 from .model import trainable_filter as trainable_filter
+from .objective import ExtraTerms as ExtraTerms
+from .objective import Term as Term
 from .prefit import initial_fields as initial_fields
 from .run import Callback as Callback
 from .run import Fitted as Fitted

@@ -193,6 +193,7 @@ def paper() -> FitConfig:
 
 
 PRESETS = {"quick": quick, "paper": paper}
+"""Presets by name: functions that give a `FitConfig`."""
 
 
 def config_to_dict(config: FitConfig) -> dict[str, Any]:

@@ -44,6 +44,7 @@ class History:
             values.append(terms.get(name, float("nan")))
 
     def record_validation(self, step: int, loss: float) -> None:
+        """Add a validation loss at a step."""
         self.validated.append(step)
         self.validation.append(loss)
 

@@ -23,6 +23,7 @@ from .devices import ONE_DEVICE, Devices, share_work
 from .history import History
 from .log import JsonLines
 from .model import AvatarFields, settle_on_person
+from .objective import ExtraTerms, check_terms
 from .pool import FramePool, centred, find_roots, label_frames
 from .prefit import initial_fields
 from .progress import progress
@@ -43,11 +44,14 @@ def fit_fields(
     resume: bool = False,
     log: str | os.PathLike[str] | None = None,
     devices: Sequence[Any] | None = None,
+    fields: AvatarFields | None = None,
+    terms: ExtraTerms | None = None,
 ) -> Fitted:
     """Learn fields from frames. `callback(step, fields, terms)` is called now and then.
 
     `checkpoint`: a file that holds the run, from which `resume` goes on; `log`: a file of one
-    JSON object a line; `devices`: those that share a step (default: all).
+    JSON object a line; `devices`: those that share a step (default: all); `fields`: to begin with,
+    in place of those of the config; `terms`: more terms of the loss.
 
     **Raises:** `ValueError` for frames that do not fit the body, or a checkpoint of another run;
     `TrainingError` naming the term that is not finite; `Interrupted` after Ctrl-C.
@@ -55,6 +59,7 @@ def fit_fields(
     started = time.perf_counter()
     deadline = None if config.minutes is None else started + 60 * config.minutes
     check_params(body, frames.params, what="frames.params")
+    check_terms(terms or {})
     sharing = share_work(config, devices)
     learned, held = choose_frames(frames, config)
     chosen = frames[np.concatenate([learned, held])]
@@ -72,9 +77,13 @@ def fit_fields(
     if log is not None and jax.process_index() == 0:
         lines = JsonLines(log, after=None if not history.steps_done else history.steps_done)
 
-    initial = initial_fields(body, config, cache=cache, verbose=verbose)
-    clock = history.lap("prefit", started)
-    start = settle_on_person(body, initial, betas, config)
+    if fields is None:
+        initial = initial_fields(body, config, cache=cache, verbose=verbose)
+        clock = history.lap("prefit", started)
+        start = settle_on_person(body, initial, betas, config)
+    else:
+        initial = start = fields
+        clock = history.lap("prefit", started)
     clock = history.lap("settle", clock)
     pool = None
     if keeper is not None and keeper.saved is not None:
@@ -105,6 +114,7 @@ def fit_fields(
             keeper=keeper,
             log=lines,
             devices=sharing,
+            terms=terms,
         )
     finally:
         history.lap("total", started)
@@ -140,6 +150,7 @@ def train_pool(
     keeper: Keeper | None = None,
     log: JsonLines | None = None,
     devices: Devices = ONE_DEVICE,
+    terms: ExtraTerms | None = None,
 ) -> Fitted:
     """Train fields on points that are labelled already, for `config.steps` or as time allows.
 
@@ -167,6 +178,7 @@ def train_pool(
         keeper=keeper,
         log=log,
         devices=devices,
+        terms=terms,
     )
     return run.to_the_end(verbose=verbose)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -50,6 +51,35 @@ def make_anchors(body: BodyModel, betas: Float[Array, " S"], config: FitConfig) 
 
 
 Terms = dict[str, Float[Array, ""]]
+Term = Callable[[AvatarFields, Batch, PRNGKeyArray], Float[Array, ""]]
+"""A loss term of one's own: `term(fields, batch, key)`, a number differentiable in the fields."""
+ExtraTerms = Mapping[str, tuple[float, Term]]
+"""Loss terms of one's own by name, each with its weight."""
+_OWN_TERMS = ("loss", "gradient", "occupancy", "bone", "joint", "surface", "found", "validation")
+
+
+def check_terms(terms: ExtraTerms) -> None:
+    """**Raises:** `ValueError` for a name that the library's own terms or the log use."""
+    taken = [name for name in terms if name.removeprefix("skinning_") in _OWN_TERMS]
+    if taken:
+        raise ValueError(f"a term cannot be named {taken[0]!r}: the log has one of that name")
+
+
+def with_extra(
+    objective: Callable[..., tuple[Float[Array, ""], Terms]], terms: ExtraTerms, prefix: str
+) -> Callable[..., tuple[Float[Array, ""], Terms]]:
+    """The objective plus terms of one's own; in its record they have a prefix."""
+
+    def both(
+        fields: AvatarFields, batch: Batch, anchors: Anchors, config: FitConfig, key: PRNGKeyArray
+    ) -> tuple[Float[Array, ""], Terms]:
+        total, known = objective(fields, batch, anchors, config, key)
+        for k, (name, (weight, term)) in enumerate(terms.items()):
+            value = term(fields, batch, jax.random.fold_in(key, k))
+            total, known = total + weight * value, {**known, f"{prefix}{name}": value}
+        return total, known
+
+    return both if terms else objective
 
 
 def geometry_objective(

@@ -98,8 +98,8 @@ def _optimiser(config: FitConfig) -> optax.GradientTransformation:
 
 @eqx.filter_jit
 def _step(
-    learned: AvatarFields, state: Any, k: Array, constant: Any, static: Any, config: FitConfig
-) -> tuple[AvatarFields, Any, Array]:
+    learned: Any, state: Any, k: Array, constant: Any, static: Any, config: FitConfig
+) -> tuple[Any, Any, Array]:
     points, distance, weights, params, fixed_arrays = constant
     network = "mlp" in (config.skinning.kind, config.geometry.kind)
     batch = _NETWORK_BATCH if network else _BATCH

@@ -24,13 +24,14 @@ from .history import History
 from .interrupt import StopFlag, stop_between_steps
 from .log import JsonLines
 from .model import AvatarFields
-from .objective import make_anchors
+from .objective import ExtraTerms, make_anchors
 from .pool import FramePool, polish_roots, tabulate_for_search
 from .progress import progress
 from .step import make_steps, with_learned
 from .validation import Best, make_validation
 
 Callback = Callable[[int, AvatarFields, dict[str, float]], None]
+"""Called as `callback(step, fields, terms)` now and then while a run goes on."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Run:
         keeper: Keeper | None,
         log: JsonLines | None,
         devices: Devices,
+        terms: ExtraTerms | None = None,
     ):
         self.clock = time.perf_counter()
         self.body, self.betas, self.start, self.initial = body, betas, start, initial
@@ -79,7 +81,7 @@ class Run:
         # The fields at the start, whose frozen leaves serve every step, where the steps run.
         self.base = devices.replicate(start)
         state, self.steps = make_steps(
-            self.base, pool, anchors, self.config, held=held, devices=devices
+            self.base, pool, anchors, self.config, held=held, devices=devices, terms=terms
         )
         self.validation = None
         if held:

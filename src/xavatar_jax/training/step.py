@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +18,14 @@ from .batch import Batch
 from .config import FitConfig
 from .devices import ONE_DEVICE, Devices
 from .model import AvatarFields, trainable_filter
-from .objective import Anchors, full_objective, geometry_objective, skinning_objective
+from .objective import (
+    Anchors,
+    ExtraTerms,
+    full_objective,
+    geometry_objective,
+    skinning_objective,
+    with_extra,
+)
 from .pool import FramePool
 
 
@@ -116,13 +124,14 @@ def make_steps(
     *,
     held: int = 0,
     devices: Devices = ONE_DEVICE,
+    terms: ExtraTerms | None = None,
 ) -> tuple[TrainState, dict[str, Step]]:
     """The first state, and the jitted steps `(state, pool) -> (state, terms)` by what they learn.
 
     With stored roots there is one for "geometry" and, if it is learned, one for "skinning"; with
-    roots searched in the step one for "both". Draws are keyed by seed and step number alone, and
-    leave out the pool's last `held` frames. A step whose loss or gradient is not finite changes
-    nothing.
+    roots searched in the step one for "both"; `terms` are added to each. Draws are keyed by seed
+    and step number alone, and leave out the pool's last `held` frames. A step whose loss or
+    gradient is not finite changes nothing.
     """
     learned, fixed = eqx.partition(fields, trainable_filter(fields, config))
     # A copy: a step gives its input state's memory to the next one.
@@ -134,7 +143,7 @@ def make_steps(
 
     def bind(plan: _Plan) -> Step:
         return lambda state, pool: _step(
-            (pool, anchors, fixed_arrays), state, static, plan, config, devices
+            (pool, anchors, fixed_arrays, dict(terms or {})), state, static, plan, config, devices
         )
 
     for plan in _plans(pool, config, held):
@@ -191,15 +200,22 @@ def _with_own(learned: AvatarFields, name: str, own: Any) -> AvatarFields:
 # Made once: a second run of the same shapes and options does not compile again.
 @eqx.filter_jit(donate="all-except-first")
 def _step(
-    constant: tuple[FramePool, Anchors, Any],
+    constant: tuple[FramePool, Anchors, Any, ExtraTerms],
     state: TrainState,
     static: Any,
     plan: _Plan,
     config: FitConfig,
     devices: Devices,
 ) -> tuple[TrainState, dict[str, Array]]:
-    pool, anchors, fixed_arrays = constant
+    pool, anchors, fixed_arrays, extra = constant
     name = plan.name
+    prefix = "skinning_" if name == "skinning" else ""
+    objective = {
+        "geometry": geometry_objective,
+        "skinning": skinning_objective,
+        "both": partial(full_objective, devices=devices),
+    }[name]
+    objective = with_extra(objective, extra, prefix)
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     batch_key, loss_key = jax.random.split(key)
     batch = draw_batch(pool, config, plan.points, plan.several, batch_key, held=plan.held)
@@ -208,9 +224,6 @@ def _step(
     def loss(own: Any) -> tuple[Array, dict[str, Array]]:
         learned = _with_own(state.learned, name, own)
         fields = eqx.combine(learned, fixed_arrays, static)
-        if name == "both":
-            return full_objective(fields, batch, anchors, config, loss_key, devices=devices)
-        objective = geometry_objective if name == "geometry" else skinning_objective
         return objective(fields, batch, anchors, config, loss_key)
 
     own = _own(state.learned, name)
@@ -228,7 +241,6 @@ def _step(
     size = optax.tree.norm(gradient)
     good = jnp.isfinite(total) & jnp.isfinite(size)
     after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)
-    prefix = "skinning_" if name == "skinning" else ""
     return devices.whole(after), {f"{prefix}loss": total, f"{prefix}gradient": size, **terms}
 
 
