@@ -54,6 +54,7 @@ def machine_facts() -> dict[str, Any]:
     from ..report import available_cores, describe_machine, gpu_advice
 
     machine = describe_machine()
+    settings: Any = jax.config
     devices = jax.devices()
     facts: dict[str, Any] = {
         "xavatar_jax": __version__,
@@ -65,13 +66,13 @@ def machine_facts() -> dict[str, Any]:
     facts |= {
         "cores": f"{machine['cores']}, {available_cores()} of them for this process",
         "environment": {name: os.environ[name] for name in _THREADS if name in os.environ},
-        "float64": jax.config.read("jax_enable_x64"),
+        "float64": settings.jax_enable_x64,
         "platform": machine["platform"],
         "commit": machine["commit"],
         "versions": {k: v for k, v in machine["versions"].items() if k != "xavatar-jax"},
         "cache": _folder(cache_dir()),
     }
-    compiled = jax.config.read("jax_compilation_cache_dir")
+    compiled = settings.jax_compilation_cache_dir
     facts["cache of compiled programs"] = _folder(Path(compiled)) if compiled else None
     models = os.environ.get("SMPLX_MODEL_DIR")
     facts["SMPLX_MODEL_DIR"] = models
