@@ -39,6 +39,8 @@ _INSTALL = skip("the environment stage installs")
 _FIT = ".venv/bin/python examples/fit_grab.py"
 _OWN = f"{_FIT} --body MODELS/smplx/SMPLX_NEUTRAL.npz --data MY_FOLDER"
 _GRAB = f"{_FIT} --model-dir MODELS --data"
+_XAVATAR = ".venv/bin/xavatar"
+_AVATAR = "out/fit_grab/avatar.npz"
 _VENV = "python3 -m venv .venv && .venv/bin/pip install -q -e"
 _FIGURES = ".venv/bin/python docs/figures/update.py"
 HOW = {
@@ -56,7 +58,16 @@ HOW = {
     f"{_OWN} --out out/mine": skip("the same with --test is run"),
     f"{_OWN} --test wave --out out/mine": How(True, SHORT),
     f"{_GRAB} GRAB/s1 --out out/s1": skip("the same with another folder is run"),
-    f"{_GRAB} AMASS/GRAB/s1 --out out/s1": How(True, SHORT),
+    f"{_GRAB} AMASS/GRAB/s1 --out out/s1": skip("tests/datasets, and the same with meshes is run"),
+    f"{_XAVATAR} fit --minutes 2 --eval-frames 4": skip("the example's stage: one code"),
+    f"{_XAVATAR} fit --steps 60 --train-frames 12 --eval-frames 2 --config.losses.surface 50 "
+    "--out out/short": skip("the example's stage, and tests/cli"),
+    f"{_XAVATAR} animate {_AVATAR} bundled --out out/animation.webp": skip(
+        "the same with another motion is run"
+    ),
+    f"{_XAVATAR} export {_AVATAR} bundled --out out/avatar.glb": skip(
+        "the same with two motions is run"
+    ),
     ".venv/bin/ruff check && .venv/bin/ruff format --check": skip("stages lint and format"),
     ".venv/bin/pyright": skip("stage types"),
     ".venv/bin/mkdocs build": skip("stage site"),

@@ -9,6 +9,7 @@ import inspect
 import json
 import re
 import sys
+from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +18,8 @@ import pytest
 
 import xavatar_jax as xa
 from xavatar_jax.body import PARTS, SMPLX_TREE, canonical_pose, pose_groups
+from xavatar_jax.cli import COMMANDS
+from xavatar_jax.cli.options import option_names
 from xavatar_jax.motion import FORMATS
 from xavatar_jax.motion.registry import WRITERS
 
@@ -73,8 +76,28 @@ def numbers(text: str) -> set[int]:
     return found
 
 
+def command_options(command: str) -> set[str]:
+    """Option names of a subcommand of `xavatar`."""
+    module = importlib.import_module(f"xavatar_jax.cli.{command}")
+    return {"--help", "--debug", *option_names(module.Options).values()}
+
+
+def config_options() -> set[str]:
+    """Options of `xavatar fit` that are entries of the config."""
+
+    def entries(config, path):
+        for entry in fields(config):
+            name = f"{path}.{entry.name.replace('_', '-')}"
+            value = getattr(config, entry.name)
+            yield from entries(value, name) if is_dataclass(value) else (name,)
+
+    return {"--config.help", *entries(xa.quick(), "--config")}
+
+
 def script_options(script: Path) -> set[str]:
     """Option names of a script: fields of its options dataclass, and arguments it adds."""
+    if script.name == "fit_grab.py":
+        return command_options("fit")
     tree = ast.parse(read(script))
     options = {"--help"}
     for node in ast.walk(tree):
@@ -143,15 +166,35 @@ def test_commands_name_files_and_options_that_exist(page):
 
 
 @each_page
+def test_commands_of_xavatar_exist_with_their_options(page):
+    for line in "".join(blocks(page, "bash")).splitlines():
+        found = re.search(r"\bxavatar (\w+)(.*)", line)
+        if found is None:
+            continue
+        assert found[1] in COMMANDS, line
+        options = set(re.findall(r"\s(--[\w.-]+)", found[2]))
+        assert options <= command_options(found[1]) | config_options(), line
+
+
+@each_page
 def test_options_named_in_sentences_exist(page):
-    known = set().union(*(script_options(script) for script in SCRIPTS))
-    named = set(re.findall(r"`(--[\w-]+)", without_blocks(page)))
+    known = set().union(*(script_options(script) for script in SCRIPTS), config_options())
+    known |= set().union(*map(command_options, COMMANDS))
+    named = set(re.findall(r"`(--[\w.-]+)", without_blocks(page)))
     assert named <= known
+
+
+def test_command_page_shows_every_command():
+    page = ROOT / "docs" / "command-line.md"
+    rows = table("command-line.md", "## Commands")
+    assert [row[0] for row in rows] == list(COMMANDS)
+    shown = set(re.findall(r"xavatar (\w+)", "".join(blocks(page, "bash"))))
+    assert shown == set(COMMANDS)
 
 
 def test_option_page_names_every_option_of_the_example():
     page = read(ROOT / "docs" / "options.md")
-    options = script_options(ROOT / "examples" / "fit_grab.py") - {"--preset", "--quiet"}
+    options = script_options(ROOT / "examples" / "fit_grab.py") - {"--preset", "--quiet", "--debug"}
     assert not [option for option in sorted(options) if option not in page]
 
 

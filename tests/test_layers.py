@@ -37,7 +37,7 @@ def imported(path: Path, tree: ast.AST) -> set[tuple[str, ...]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name.split(".") for alias in node.names]
-            found |= {tuple(name[1:]) for name in names if name[0] == "xavatar_jax"}
+            found |= {tuple(name[1:]) for name in names if name[0] == "xavatar_jax" and name[1:]}
         elif isinstance(node, ast.ImportFrom):
             base = tuple((node.module or "").split(".")) if node.module else ()
             if node.level:

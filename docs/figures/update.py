@@ -329,7 +329,9 @@ def floor_view(record: dict[str, Any]) -> str:
     """The truth against itself."""
     rows = [["samples on either mesh", *(f"bounding-box IoU, {region}" for region in REGIONS)]]
     for row in record["rows"]:
-        rows.append([str(row["samples"]), *(f"{row[f'iou_box_{region}']:.3f}" for region in REGIONS)])
+        rows.append(
+            [str(row["samples"]), *(f"{row[f'iou_box_{region}']:.3f}" for region in REGIONS)]
+        )
     header = record["header"]
     return f"{_table(rows)}\n\n{_machine(header)}; {header['frames']} held-out frames."
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import runpy
 import sys
@@ -14,7 +13,9 @@ import numpy as np
 import pytest
 
 import xavatar_jax as xa
+from xavatar_jax import report
 from xavatar_jax.avatar import Evaluation
+from xavatar_jax.cli import fit as command
 from xavatar_jax.metrics import MeshMetrics, RegionValues
 from xavatar_jax.training import Interrupted, loop
 
@@ -32,13 +33,7 @@ def read_by(frames: xa.Frames, events: list[str]) -> xa.Frames:
 
 
 def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatch):
-    """The example from end to end: no held-out mesh is read before `fit` has ended."""
-    spec = importlib.util.spec_from_file_location("fit_grab", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "fit_grab", example)
-    spec.loader.exec_module(example)
+    """The command from end to end: no held-out mesh is read before `fit` has ended."""
     events: list[str] = []
     test = read_by(run.test, events)
     capture = SimpleNamespace(body=run.body, name="case", train=run.train, test=test, notices=())
@@ -59,12 +54,12 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
     monkeypatch.setattr(loop, "settle_on_person", lambda *_: run.fit.before.fields)
     monkeypatch.setattr(xa, "fit", noted_fit)
     monkeypatch.setattr(xa, "evaluate", quick_evaluate)
-    monkeypatch.setattr(example, "load", lambda options: capture)
-    monkeypatch.setattr(example, "configure", lambda options: short)
-    monkeypatch.setattr(example, "write_meshes", lambda *_: [])
-    monkeypatch.setattr(example, "preview", lambda *_: np.zeros((4, 4, 3), np.uint8))
-    monkeypatch.setattr(example, "animation", lambda *_: [np.zeros((4, 4, 3), np.uint8)] * 2)
-    example.main(example.Options(out=tmp_path, quiet=True))
+    monkeypatch.setattr(command, "load", lambda options: capture)
+    monkeypatch.setattr(command, "configure", lambda options: short)
+    monkeypatch.setattr(command, "write_meshes", lambda *_: [])
+    monkeypatch.setattr(report, "preview", lambda *_: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr(report, "animation", lambda *_: [np.zeros((4, 4, 3), np.uint8)] * 2)
+    command.run(command.Options(out=tmp_path, quiet=True))
 
     assert events[:2] == ["fit begins", "fit ends"]
     assert any(event.startswith("read") for event in events[2:])
@@ -117,6 +112,6 @@ def test_the_example_says_how_to_go_on(run, tmp_path, monkeypatch, capsys, numbe
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(EXAMPLE), run_name="__main__")
     assert ended.value.code == code
-    said = capsys.readouterr().out
+    said = capsys.readouterr().err
     assert "checkpoint.npz" in said
     assert "--resume" in said

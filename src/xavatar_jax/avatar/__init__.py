@@ -11,3 +11,4 @@ from .fit import fit as fit
 from .query import Query as Query
 from .rigging import GlbExport as GlbExport
 from .store import load_avatar as load_avatar
+from .store import load_avatar_body as load_avatar_body

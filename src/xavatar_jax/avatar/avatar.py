@@ -190,7 +190,7 @@ class Avatar:
         motion: Motions | None = None,
         *,
         influences: Literal[4, 8] = 4,
-        expressions: bool = True,
+        expressions: bool | int = True,
         colors: UInt8[np.ndarray, "V C"] | None = None,
         up: Literal["y", "z"] | None = None,
         verbose: bool = True,
@@ -200,7 +200,8 @@ class Avatar:
         `motion` is one motion, parameters `(T, ...)` at 30 frames a second, or several by the
         names that their clips get. The file is in metres with y up, whatever the motions' own up
         axis (`up` for parameters, else y). Eight `influences` lose less than four; Blender reads
-        them, three.js takes the first four. `colors` are sRGB, one row a vertex of
+        them, three.js takes the first four. `expressions`: how many coefficients get blend shapes,
+        the first ones (True: all; False or 0: none). `colors` are sRGB, one row a vertex of
         `canonical_mesh()`, in place of the mesh's own.
 
         What the file loses against `animate` is measured on 24 frames, returned, and printed

@@ -90,7 +90,7 @@ def export_glb(
     motion: Motions | None = None,
     *,
     influences: Literal[4, 8] = 4,
-    expressions: bool = True,
+    expressions: bool | int = True,
     colors: UInt8[np.ndarray, "V C"] | None = None,
     up: Literal["y", "z"] | None = None,
     verbose: bool = True,
@@ -100,7 +100,7 @@ def export_glb(
     with atomic_path(path) as temporary:  # first of all: an unwritable path costs no minute
         animations = {name: animate(avatar, each) for name, each in _named(motion).items()}
         ups = {name: up or getattr(each, "up", "y") for name, each in _named(motion).items()}
-        scales = expression_scales(avatar, list(animations.values())) if expressions else None
+        scales = expression_scales(avatar, list(animations.values()), expressions)
         rig = build_rig(avatar, scales, colors=colors)
         clips = [
             build_clip(name, each, rig, scales, ups[name]) for name, each in animations.items()
@@ -131,9 +131,25 @@ def export_weights(avatar: Avatar, path: str | os.PathLike[str]) -> None:
     write_weights(path, build_rig(avatar))
 
 
-def expression_scales(avatar: Avatar, animations: list[Animation]) -> Float[np.ndarray, " E"]:
-    """The coefficient that a blend shape's weight of one stands for: the largest, at least 1."""
+def expression_scales(
+    avatar: Avatar, animations: list[Animation], expressions: bool | int = True
+) -> Float[np.ndarray, " E"] | None:
+    """The coefficient that a blend shape's weight of one stands for: the largest, at least 1.
+
+    `expressions`: how many coefficients get blend shapes, the first ones; True: all that the
+    avatar has; False: none.
+
+    **Raises:** `ValueError` for more than it has, or fewer than none.
+    """
+    if expressions is False:
+        return None
     count = canonical_params(avatar.body).expression.shape[-1]
+    if expressions is not True:
+        if not 0 <= expressions <= count:
+            raise ValueError(
+                f"expressions={expressions}; the avatar has {count} coefficients of expression"
+            )
+        count = expressions
     scales = np.ones(count)
     for animation in animations:
         found = np.abs(np.asarray(animation.params.expression, np.float64)).max(0)[:count]
@@ -179,7 +195,8 @@ def expression_targets(
     if not count:
         return np.zeros((0, base.vertices.shape[1], 3))
     neutral = canonical_params(avatar.body, jnp.asarray(avatar.betas))
-    both = np.concatenate([np.eye(count), -np.eye(count)])
+    unit = np.eye(count, neutral.expression.shape[-1])
+    both = np.concatenate([unit, -unit])
     params = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], len(both), 0), neutral)
     params = replace(params, expression=both.astype(params.pose.dtype))
     conditions = drive_frames(avatar.fields, avatar.body, params).conditions

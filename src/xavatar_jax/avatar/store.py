@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,12 +66,9 @@ def load_avatar(
     **Raises:** `FileNotFoundError` if the body's file is gone, `ValueError` if the body given, or
     the file found, is another one, or if the avatar file is damaged or from a newer version.
     """
-    arrays, header = load_arrays(path)
-    if header.get("kind") != "avatar":
-        raise ValueError(f"{os.fspath(path)}: not an avatar file")
-    refuse_newer(path, header, _FORMAT, written_by=header["version"])
+    arrays, header = _read(path)
     known = header["body"]
-    body = _find_body(path, known) if body is None else body
+    body = _find_body(path, known, None) if body is None else body
     if body.source.checksum != known["checksum"]:
         raise ValueError(
             f"{os.fspath(path)}: learned on another body. It needs {known['kind']} "
@@ -94,18 +92,47 @@ def _kept(fields: AvatarFields, avatar: Avatar) -> AvatarFields:
     return eqx.filter(fields, kept)
 
 
-def _find_body(path: str | os.PathLike[str], known: dict[str, Any]) -> BodyModel:
-    file = Path(known["path"])
-    if file.exists():
+def load_avatar_body(
+    path: str | os.PathLike[str], file: str | os.PathLike[str] | None = None
+) -> BodyModel:
+    """The body model that an avatar file names, or the one in `file`, with as many coefficients.
+
+    It is not compared with the avatar's: `load_avatar(path, body=...)` does that.
+
+    **Raises:** as `load_avatar` and `load_body`.
+    """
+    return _find_body(path, _read(path)[1]["body"], file)
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays and header of an avatar file."""
+    arrays, header = load_arrays(path)
+    check_header(path, header)
+    return arrays, header
+
+
+def check_header(path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
+    """**Raises:** `ValueError` unless it is the header of an avatar file that we can read."""
+    if header.get("kind") != "avatar":
+        raise ValueError(f"{os.fspath(path)}: not an avatar file")
+    refuse_newer(path, header, _FORMAT, written_by=header["version"])
+
+
+def _find_body(
+    path: str | os.PathLike[str], known: dict[str, Any], file: str | os.PathLike[str] | None
+) -> BodyModel:
+    place = Path(known["path"]) if file is None else Path(file)
+    if file is not None or place.exists():
         return load_body(
-            file,
+            place,
+            kind=known["kind"] if known["kind"] != "other" else "smplx",
             gender=known["gender"],
             num_betas=known["num_betas"],
             num_expression=known["num_expression"],
         )
-    if file.name.startswith("synthetic_body"):
+    if place.name.startswith("synthetic_body"):
         return synthetic_body()
     raise FileNotFoundError(
-        f"{os.fspath(path)}: its body model is not at {file} any more. Pass the {known['kind']} "
+        f"{os.fspath(path)}: its body model is not at {place} any more. Pass the {known['kind']} "
         f"({known['gender']}) model it was learned on: load_avatar(path, body=load_body(...))"
     )

@@ -8,4 +8,5 @@ from .load import find_gender as find_gender
 from .load import load_data as load_data
 from .prepared import load_prepared as load_prepared
 from .synthetic import synthetic_capture as synthetic_capture
+from .synthetic import synthetic_capture_folder as synthetic_capture_folder
 from .synthetic import write_synthetic_capture as write_synthetic_capture

@@ -14,7 +14,7 @@ from .._version import __version__
 from .atomic import atomic_path
 from .unpickle import load_npz
 
-_HEADER = "header.json"
+HEADER = "header.json"
 
 
 def save_arrays(
@@ -24,7 +24,7 @@ def save_arrays(
     encoded = np.frombuffer(json.dumps(dict(header)).encode(), np.uint8)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         named: dict[str, Any] = {k: np.asarray(v) for k, v in arrays.items()}
-        np.savez(file, **{_HEADER: encoded}, **named)
+        np.savez(file, **{HEADER: encoded}, **named)
 
 
 def load_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -33,9 +33,9 @@ def load_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
     **Raises:** `ValueError` naming the file if it was not written by `save_arrays`.
     """
     entries = load_npz(path)
-    if _HEADER not in entries:
-        raise ValueError(f"{os.fspath(path)}: no {_HEADER} inside, so it is not one of our files")
-    header = json.loads(bytes(entries.pop(_HEADER)).decode())
+    if HEADER not in entries:
+        raise ValueError(f"{os.fspath(path)}: no {HEADER} inside, so it is not one of our files")
+    header = json.loads(bytes(entries.pop(HEADER)).decode())
     return entries, header
 
 

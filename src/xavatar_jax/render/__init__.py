@@ -6,6 +6,7 @@ from .camera import part_view as part_view
 from .colormap import color_bar as color_bar
 from .colormap import error_colors as error_colors
 from .picture import render_mesh as render_mesh
+from .save import save_gif_animation as save_gif_animation
 from .save import save_png as save_png
 from .save import save_webp_animation as save_webp_animation
 from .sheet import draw_text as draw_text

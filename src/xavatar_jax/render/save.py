@@ -35,6 +35,30 @@ def save_webp_animation(
         OSError: if the file cannot be written.
         ValueError: if there are no frames, they differ in shape, or `fps` is not positive.
     """
+    _save_animation(frames, path, fps, "WEBP", quality=quality, method=2)
+
+
+def save_gif_animation(
+    frames: Iterable[np.ndarray], path: str | os.PathLike[str], fps: float | int = 15.0
+) -> None:
+    """Write frames of one size as an endless GIF, whole or not at all.
+
+    GIF has 256 colours and counts in hundredths of a second: WebP is smaller and better.
+
+    Raises:
+        OSError: if the file cannot be written.
+        ValueError: if there are no frames, they differ in shape, or `fps` is not positive.
+    """
+    _save_animation(frames, path, fps, "GIF")
+
+
+def _save_animation(
+    frames: Iterable[np.ndarray],
+    path: str | os.PathLike[str],
+    fps: float,
+    format: str,
+    **options: int,
+) -> None:
     from PIL import Image
 
     if not fps > 0:
@@ -48,13 +72,12 @@ def save_webp_animation(
     with atomic_path(path) as temporary:
         first.save(
             temporary,
-            format="WEBP",
+            format=format,
             save_all=True,
             append_images=rest,
             duration=max(1, round(1000.0 / fps)),
             loop=0,
-            quality=quality,
-            method=2,
+            **options,
         )
 
 

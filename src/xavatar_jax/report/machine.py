@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGES = ("xavatar-jax", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy", "libigl")
+_CUDA_PLUGINS = ("jax-cuda12-plugin", "jax-cuda13-plugin")
 
 
 def describe_machine() -> dict[str, Any]:
@@ -38,14 +40,44 @@ def peak_rss_mb() -> float | None:
     return peak / (1024 if sys.platform != "darwin" else 1024**2)
 
 
+def available_cores() -> int:
+    """Cores that this process may use: fewer than the machine has where it is pinned."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def gpu_advice(platforms: set[str]) -> str | None:
+    """What to do if there is an NVIDIA GPU that JAX does not see; None if all is well.
+
+    `platforms`: those of JAX's devices ("cpu", "gpu", ...).
+    """
+    if platforms - {"cpu"} or not nvidia_gpu_present():
+        return None
+    found = "an NVIDIA GPU is here, but JAX runs on the CPU: "
+    if any(_version(plugin) for plugin in _CUDA_PLUGINS):
+        return found + (
+            "its support is installed, but does not start; look at nvidia-smi, and at "
+            "JAX_PLATFORMS and CUDA_VISIBLE_DEVICES in the environment"
+        )
+    return found + 'install its support with pip install "xavatar-jax[gpu]"'
+
+
+def nvidia_gpu_present() -> bool:
+    """Whether the system shows an NVIDIA GPU: its device, its driver, or the driver's tool."""
+    here = any(Path(place).exists() for place in ("/dev/nvidia0", "/proc/driver/nvidia"))
+    return here or shutil.which("nvidia-smi") is not None
+
+
 def _versions() -> dict[str, str | None]:
-    found: dict[str, str | None] = {}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    return found
+    return {package: _version(package) for package in _PACKAGES}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def _commit() -> str | None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
-from ..avatar import Avatar
+from ..avatar import Animation, Avatar
 from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyParams
 from ..frames import Frame, Frames
 from ..geometry import closest_points
@@ -73,12 +74,10 @@ def animation(
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """The avatar beside the truth, `count` frames of one sequence from a fixed camera."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
-    reach = np.concatenate(
-        [avatar.posed_template(frames[int(k)].params) for k in chosen[:: max(len(chosen) // 8, 1)]]
-    )
-    camera = frame_view(reach, "front", forward=_facing(frames[int(chosen[0])].params))
+    params = frames[chosen].params
+    camera = frame_view(_reach(avatar, params), "front", forward=_facing(params[0]))
     pictures = []
-    meshes = avatar.animate(frames[chosen].params)
+    meshes = avatar.animate(params)
     for k, mesh in zip(chosen, meshes, strict=True):
         frame = frames[int(k)]
         truth = Mesh(frame.vertices, frame.faces).compute_normals()
@@ -88,6 +87,41 @@ def animation(
         ]
         pictures.append(grid_picture([row], column_labels=["ground truth", "avatar"]))
     return pictures
+
+
+def motion_pictures(
+    animation: Animation,
+    *,
+    size: int | tuple[int, int] = 512,
+    view: str = "front",
+    shading: str = "color",
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """A picture of every frame of an animation, from a fixed camera that has all of it in view.
+
+    `size` in pixels, one number or width and height; `view` as for `frame_view`, counted from
+    where the person looks in the first frame; `shading` as for `render_mesh`. y is up.
+    """
+    width, height = (size, size) if isinstance(size, int) else size
+    reach = _reach(animation.avatar, animation.params)
+    forward = _facing(animation.params[0])
+    camera = frame_view(reach, view, forward=forward, aspect=width / height)
+    floor = float(reach[:, 1].min())
+    for mesh in animation:
+        yield render_mesh(
+            mesh.compute_normals(),
+            camera,
+            (width, height),
+            shading=shading,
+            base_color=_SKIN,
+            ground=shading == "color",
+            ground_height=floor,
+        )
+
+
+def _reach(avatar: Avatar, params: BodyParams, count: int = 8) -> Float[np.ndarray, "N 3"]:
+    """Vertices of the body in frames spread over a motion, which a camera has to show."""
+    chosen = np.unique(np.linspace(0, len(params) - 1, min(count, len(params))).astype(int))
+    return np.concatenate([avatar.posed_template(params[int(k)]) for k in chosen])
 
 
 def _facing(params: BodyParams) -> tuple[float, float, float]:

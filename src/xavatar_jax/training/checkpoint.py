@@ -145,9 +145,7 @@ def load_checkpoint(path: str | os.PathLike[str], identity: RunIdentity) -> Chec
     if not Path(path).exists():
         raise FileNotFoundError(f"no checkpoint at {name}")
     arrays, header = load_arrays(path)
-    if header.get("kind") != "checkpoint":
-        raise ValueError(f"{name}: not a checkpoint, but {header.get('kind', 'something else')}")
-    refuse_newer(path, header, _FORMAT, written_by=header["versions"]["xavatar_jax"])
+    check_header(path, header)
     run = header["run"]
     for part, found, wanted in (
         ("body", run["body"], identity.body),
@@ -180,6 +178,14 @@ def load_checkpoint(path: str | os.PathLike[str], identity: RunIdentity) -> Chec
             stacklevel=3,
         )
     return Checkpoint(name, arrays, header)
+
+
+def check_header(path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
+    """**Raises:** `ValueError` unless it is the header of a checkpoint that we can read."""
+    if header.get("kind") != "checkpoint":
+        kind = header.get("kind", "something else")
+        raise ValueError(f"{os.fspath(path)}: not a checkpoint, but {kind}")
+    refuse_newer(path, header, _FORMAT, written_by=header["versions"]["xavatar_jax"])
 
 
 @dataclass(frozen=True)

@@ -113,9 +113,18 @@ def synthetic_capture(
         verbose: show a progress bar.
     """
     body = synthetic_body(cache) if body is None else body
+    folder = synthetic_capture_folder(cache, body)
+    return load_grab(folder, body, gender=None, verbose=verbose)
+
+
+def synthetic_capture_folder(
+    cache: str | Path | None = None, body: BodyModel | None = None
+) -> Path:
+    """The folder of the bundled capture, `train/*.npz` and `test/*.npz`; made if missing."""
+    body = synthetic_body(cache) if body is None else body
     key = f"synthetic_capture-{code_checksum()}-{body.source.checksum[:12]}"
     folder = cache_dir(cache) / key
     if not folder.is_dir():
         with suppress(FileExistsError):  # another process was quicker
             write_synthetic_capture(folder, body)
-    return load_grab(folder, body, gender=None, verbose=verbose)
+    return folder

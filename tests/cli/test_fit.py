@@ -1,0 +1,135 @@
+"""`xavatar fit` and `xavatar evaluate`: options, config, what is asked of the library."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+import xavatar_jax as xa
+from xavatar_jax.cli import fit
+from xavatar_jax.training import TrainingError
+
+
+def config_of(*words: str) -> xa.FitConfig:
+    return fit.configure(fit.parse(words, "xavatar fit"))
+
+
+def test_presets_and_short_options():
+    assert config_of() == xa.quick()
+    assert config_of("--preset", "paper") == xa.paper()
+    expected = replace(xa.quick(), steps=5, seed=3, minutes=0.5, train_frames=0, prefit_steps=7)
+    given = "--steps 5 --seed 3 --minutes 0.5 --train-frames 0 --prefit-steps 7"
+    assert config_of(*given.split()) == expected
+
+
+def test_every_other_entry_is_an_option():
+    given = (
+        "--config.points-per-step 256 --seed 4 --config.losses.surface 50 --preset paper "
+        "--config.points.sigma 0.001 0.02 --config.optimiser.learning-rate=3e-3 "
+        "--config.search.cached --config.geometry.mlp.width 64 --steps 9"
+    )
+    base = xa.paper()
+    expected = replace(
+        base,
+        seed=4,
+        steps=9,
+        points_per_step=256,
+        losses=replace(base.losses, surface=50.0),
+        points=replace(base.points, sigma=(0.001, 0.02)),
+        optimiser=replace(base.optimiser, learning_rate=3e-3),
+        search=replace(base.search, cached=True),
+        geometry=replace(base.geometry, mlp=replace(base.geometry.mlp, width=64)),
+    )
+    assert config_of(*given.split()) == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--config.steps", "3"], "an option of its own, --steps"),
+        (["--config.train-frames=3"], "an option of its own, --train-frames"),
+        (["--config.losses.surfac", "3"], "Unrecognized"),
+        (["--config.losses.surface", "much"], "surface"),
+        (["--eval-frames", "0"], 'a number above zero or "all"'),
+        (["--preset", "slow"], "preset"),
+        (["--data", "nowhere"], "nowhere"),
+        (["--body", "nowhere.npz"], "no body model found"),
+    ],
+)
+def test_wrong_options(call, tmp_path, monkeypatch, bundled_body, words, complaint):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(xa, "synthetic_body", lambda *_: bundled_body)
+    code, _, error = call("fit", "--quiet", *words)
+    assert code == 2
+    assert complaint in error
+
+
+def test_help_of_the_config_is_apart(call):
+    code, short, _ = call("fit", "--help")
+    assert code == 0
+    assert "--config.help" in short
+    assert "--config.losses" not in short.replace("as --config.losses.surface 50", "")
+    code, full, _ = call("fit", "--preset", "paper", "--config.help")
+    assert code == 0
+    assert "--config.points-per-step" in full
+    assert "(default: 6000)" in full
+    assert "--config.steps" not in full
+
+
+def test_what_it_asks_of_the_library(call, tmp_path, monkeypatch, bundled_body):
+    asked = {}
+    capture = SimpleNamespace(body=bundled_body, name="case", train=[1], test=[2])
+
+    def stop(frames, config, **options):
+        asked.update(options, frames=frames, config=config)
+        raise TrainingError("the occupancy term is nan at step 3", step=3)
+
+    monkeypatch.setattr(xa, "synthetic_body", lambda *_: bundled_body)
+    monkeypatch.setattr(xa, "synthetic_capture", lambda *_, **__: capture)
+    monkeypatch.setattr(xa, "fit", stop)
+    out = tmp_path / "out"
+    code, said, error = call("fit", "--out", out, "--resume", "--config.losses.bone", 2)
+    assert (code, error) == (1, "error: the occupancy term is nan at step 3\n")
+    assert "case: 1 training and 1 held-out frames" in said
+    assert asked["frames"] == [1]
+    assert asked["config"].losses.bone == 2
+    assert asked["resume"]
+    assert asked["checkpoint"] == out / "checkpoint.npz"
+    assert asked["log"] == out / "log.jsonl"
+
+    file = tmp_path / "file"
+    file.write_text("")
+    code, _, error = call("fit", "--out", file / "out")
+    assert code == 2
+    assert "is no folder" in error
+
+
+@pytest.mark.usefixtures("coarse")
+def test_evaluate_prints_and_writes_the_same_figures(call, avatar_file, tmp_path):
+    out = tmp_path / "figures" / "metrics.json"
+    code, said, error = call("evaluate", avatar_file, "--eval-frames", 1, "--out", out)
+    assert (code, error) == (0, "")
+    record = json.loads(out.read_text())
+    assert record["frames"] == 1
+    assert record["preset"] == "paper"
+    # A ball of half a metre is no person: centimetres away.
+    assert 20 < record["cd_mm"]["all"] < 1000
+    row = next(line for line in said.splitlines() if line.startswith("Chamfer"))
+    assert f"{record['cd_mm']['all']:.2f}" in row
+    assert str(out) in said
+
+
+def test_evaluate_looks_at_its_input_first(call, avatar_file, motion_file, tmp_path):
+    code, _, error = call("evaluate", motion_file, "--out", tmp_path / "a.json")
+    assert code == 2
+    assert "not one of our files" in error
+    code, _, error = call("evaluate", avatar_file, "--data", tmp_path / "no")
+    assert code == 2
+    assert "No data folder" in error
+    code, _, error = call("evaluate", avatar_file, "--out", tmp_path)
+    assert code == 2
+    assert "there is a folder of this name" in error
+    assert list(tmp_path.iterdir()) == []
