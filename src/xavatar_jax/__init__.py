@@ -34,3 +34,7 @@ from .motion import save_motion as save_motion
 from .training import FitConfig as FitConfig
 from .training import paper as paper
 from .training import quick as quick
+from .view import HtmlPage as HtmlPage
+from .view import Viewer as Viewer
+from .view import view as view
+from .view import view_html as view_html
