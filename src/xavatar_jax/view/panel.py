@@ -45,7 +45,6 @@ class Panel:
         self._tree = tree
         self._changed = changed
         self._turns: dict[int, list[float]] = {}
-        self._quiet = False
         self.seeks = 0
         self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._gui.set_panel_label("xavatar_jax")
@@ -64,7 +63,7 @@ class Panel:
         bone = None if self.bone.value == _ALL else self._tree.index(self.bone.value)
         turns = tuple(
             (joint, (t[0], t[1], t[2]))
-            for joint, t in sorted(self._turns.items())
+            for joint, t in sorted(dict(self._turns).items())
             if any(abs(v) > 1e-9 for v in t)
         )
         return Wish(
@@ -84,10 +83,8 @@ class Panel:
     def reset(self) -> None:
         """All joints and coefficients of the sliders back to zero."""
         self._turns.clear()
-        self._quiet = True
         for slider in self._expression:
             slider.value = 0.0
-        self._quiet = False
         for show in self._groups:
             show()
         self._changed()
@@ -111,11 +108,11 @@ class Panel:
             # Moved by hand, not by the player.
             if event.client_id is not None:
                 self.seeks += 1
-            self._note_change()
+            self._changed()
 
         self.frame.on_update(sought)
         for handle in (self.playing, self.speed, self.in_place):
-            handle.on_update(lambda _: self._note_change())
+            handle.on_update(lambda _: self._changed())
 
     def _add_shading(self, shadings: tuple[str, ...], max_error_mm: float) -> None:
         with self._gui.add_folder("Show"):
@@ -127,10 +124,10 @@ class Panel:
         def chosen(_: Any) -> None:
             self.bone.visible = self.shading.value == WEIGHTS
             legend.visible = self.shading.value == ERROR
-            self._note_change()
+            self._changed()
 
         self.shading.on_update(chosen)
-        self.bone.on_update(lambda _: self._note_change())
+        self.bone.on_update(lambda _: self._changed())
 
     def _add_joints(self, name: str, choices: dict[str, tuple[int, ...]]) -> Callable[[], None]:
         """Sliders of one group; gives the function that shows the stored turns on them."""
@@ -145,18 +142,16 @@ class Panel:
 
         def show() -> None:
             turn = self._turns.get(choices[joint.value][0], [0.0, 0.0, 0.0])
-            self._quiet = True
             for slider, value in zip(sliders, np.rad2deg(turn), strict=True):
                 slider.value = float(np.clip(np.round(value), -_LARGEST_TURN, _LARGEST_TURN))
-            self._quiet = False
 
-        def turn(_: Any) -> None:
-            if self._quiet:
+        def turn(event: Any) -> None:
+            if event.client_id is None:  # set by `show`, not by hand
                 return
             values = [float(np.deg2rad(slider.value)) for slider in sliders]
             for each in choices[joint.value]:
                 self._turns[each] = list(values)
-            self._note_change()
+            self._changed()
 
         joint.on_update(lambda _: show())
         for slider in sliders:
@@ -170,9 +165,5 @@ class Panel:
                 for k in range(count)
             ]
         for slider in sliders:
-            slider.on_update(lambda _: self._note_change())
+            slider.on_update(lambda _: self._changed())
         return sliders
-
-    def _note_change(self) -> None:
-        if not self._quiet:
-            self._changed()

@@ -83,7 +83,7 @@ class Viewer:
         self._stopped.set()
         self._changed.set()
         if self._worker.is_alive() and self._worker is not threading.current_thread():
-            self._worker.join(timeout=60)
+            self._worker.join(timeout=10)
         self._server.stop()
         self._server = None
 
@@ -125,16 +125,24 @@ class Viewer:
             self._changed.clear()
             wish = self.panel.wish()
             if wish != self.shown:
-                surface = self._surfaces(wish)
-                self._stage.show(surface)
-                self.panel.say(surface.note)
-                self.shown = wish
-                self._shown.set()
+                self._show(wish)
             if self.panel.playing.value:
                 pause = 1.0 / _FASTEST - (time.perf_counter() - started)
                 self._stopped.wait(max(pause, 0.001))
             else:
                 self._changed.wait()
+
+    def _show(self, wish: Wish) -> None:
+        try:
+            surface = self._surfaces(wish)
+        except Exception as error:  # one frame that cannot be read does not end the viewer
+            self.panel.say(f"**Frame {wish.frame} cannot be shown:** {error}")
+            print(f"frame {wish.frame} cannot be shown: {error}", file=sys.stderr)
+        else:
+            self._stage.show(surface)
+            self.panel.say(surface.note)
+        self.shown = wish
+        self._shown.set()
 
 
 class _Clock:
