@@ -40,6 +40,10 @@ if TYPE_CHECKING:
     from .training import FitConfig as FitConfig
     from .training import paper as paper
     from .training import quick as quick
+    from .view import HtmlPage as HtmlPage
+    from .view import Viewer as Viewer
+    from .view import view as view
+    from .view import view_html as view_html
 
 # What is imported on first use, so that `xavatar --help` does not wait for JAX.
 _HOMES = {
@@ -63,6 +67,7 @@ _HOMES = {
     "meshing": ("Mesh",),
     "motion": ("Motion", "MotionNotice", "concat", "load_motion", "save_motion"),
     "training": ("FitConfig", "paper", "quick"),
+    "view": ("HtmlPage", "Viewer", "view", "view_html"),
 }
 _NAMES = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -119,6 +119,71 @@ def test_a_flat_part_is_seen_on_its_broad_side():
     assert camera.position[1] > 0
 
 
+def test_a_turntable_goes_round_at_one_scale():
+    box = trimesh.creation.box((0.8, 1.6, 0.3))
+    vertices = np.asarray(box.vertices) + np.array([1, 2, 3])
+    mesh = Mesh(vertices, np.asarray(box.faces))
+    pictures = render.turntable(mesh, 4, (120, 160), ground=False, background=None, elevation=0.0)
+    front, side, back, other = (picture[..., 3] > 127 for picture in pictures)
+    np.testing.assert_array_equal(front, back)
+    np.testing.assert_array_equal(side, other)
+    # Wide in front, narrow from the side; nearer corners make it a little wider than 0.3.
+    assert 0.3 / 0.8 < side.sum() / front.sum() < 0.55
+    for camera in render.orbit_views(vertices, 5, aspect=0.75):
+        pixels = camera.project(vertices, 120, 160)
+        assert pixels[:, :2].min() > 0
+        assert (pixels[:, :2] < [120, 160]).all()
+        assert np.linalg.norm(camera.position - [1, 2, 3]) == pytest.approx(
+            np.linalg.norm(render.orbit_views(vertices, 1)[0].position - [1, 2, 3]), rel=0.2
+        )
+    first = render.orbit_views(vertices, 4)
+    # The second view is from the person's left, +x for one who faces +z.
+    assert first[1].position[0] > 2
+    with pytest.raises(ValueError, match="must be 1 or more"):
+        render.turntable(mesh, 0)
+
+
+def test_edges_inside_the_outline_are_smooth():
+    left, right = sphere(0.5, color=(255, 0, 0)), sphere(0.5, color=(0, 0, 255))
+    colors = np.where(left.vertices[:, :1] * [1, 1, 1] < 0.013, left.colors, right.colors)
+    mesh = Mesh(left.vertices, left.faces, colors=colors.astype(np.uint8))
+    camera = render.Camera.look_at((0.4, 0.3, 3), (0, 0, 0), fov=math.radians(24))
+    fine, plain, many = (
+        render.render_mesh(mesh, camera, 90, shading="flat", supersample=k).astype(float)
+        for k in (3, 1, 9)
+    )
+    assert np.abs(fine - many).mean() < 0.35 * np.abs(plain - many).mean()
+
+
+def test_shadows_do_not_depend_on_how_finely_a_shape_is_cut():
+    camera = front_camera()
+    coarse, fine = (
+        trimesh.creation.icosphere(subdivisions=k, radius=0.5) for k in (4, 6)
+    )  # the finer one has so many vertices that only some of them are asked
+    assert len(fine.vertices) > 40_000
+    pictures = [
+        render.render_mesh(Mesh(np.asarray(s.vertices), np.asarray(s.faces)), camera, 150)
+        for s in (coarse, fine)
+    ]
+    inside = (slice(45, 105), slice(45, 105))
+    difference = np.abs(pictures[0][inside].astype(int) - pictures[1][inside])
+    assert difference.mean() < 3
+
+
+def test_weight_colors():
+    weights = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.25, 0.75]])
+    one = render.weight_colors(weights, 0).astype(int)
+    np.testing.assert_array_equal(one[[2, 1, 0]], render.WEIGHT_RAMP)
+    palette = render.bone_palette(3).astype(float)
+    np.testing.assert_allclose(render.weight_colors(weights), weights @ palette, atol=0.51)
+    many = render.bone_palette(55).astype(int)
+    assert np.abs(np.diff(many, axis=0)).max(axis=1).min() > 40
+    with pytest.raises(ValueError, match="no bone 3"):
+        render.weight_colors(weights, 3)
+    with pytest.raises(ValueError, match=r"shape \(V, J\)"):
+        render.weight_colors(weights[0])
+
+
 def test_error_colors():
     colors = render.error_colors([0.0, 1.0, 2.0, 5.0, np.nan], 2.0).astype(int)
     assert colors[0, 2] > colors[0, 0]

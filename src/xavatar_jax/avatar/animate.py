@@ -319,9 +319,28 @@ def skin_columns(
     return (m[:, 0] * x + m[:, 1] * y + m[:, 2] * z + m[:, 3]).T
 
 
+def posed_frame(avatar: Avatar, params: BodyParams) -> Float[np.ndarray, "V 3"]:
+    """Vertices of one frame in `Animation`'s cached way, metres, for parameters without a batch.
+
+    For poses that come one at a time: nothing is compiled for a number of frames.
+
+    **Raises:** `ValueError` for parameters that do not fit the body.
+    """
+    own = own_batch(avatar, params, "parameters")[0]
+    drive = _drive_frame(avatar.fields, avatar.body, own)
+    return np.asarray(posed_vertices(avatar.posable, drive.conditions, drive.transforms, True))
+
+
+_drive_frame = eqx.filter_jit(
+    lambda fields, body, params: Drive(
+        fields.geometry.condition(params), bone_transforms(body, params)
+    )
+)
+
+
 @eqx.filter_jit
 def _drive_block(fields: AvatarFields, body: BodyModel, params: BodyParams) -> Drive:
-    return jax.vmap(lambda p: Drive(fields.geometry.condition(p), bone_transforms(body, p)))(params)
+    return jax.vmap(lambda p: _drive_frame(fields, body, p))(params)
 
 
 def drive_frames(fields: AvatarFields, body: BodyModel, params: BodyParams) -> Drive:

@@ -11,6 +11,7 @@ from .meshes import write_ply as write_ply
 from .rig import Clip as Clip
 from .rig import Rig as Rig
 from .rig import joint_worlds as joint_worlds
+from .rig import rotation_quaternions as rotation_quaternions
 from .sequence import SequenceFormat as SequenceFormat
 from .sequence import write_sequence as write_sequence
 from .weights import write_weights as write_weights

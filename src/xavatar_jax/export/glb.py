@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8, UInt16
 from .._version import __version__
 from ..files import atomic_path
 from .influences import limit_influences
-from .rig import Clip, Rig
+from .rig import Clip, Rig, rotation_quaternions
 
 Color = tuple[float, float, float]
 SKIN_COLOR: Color = (0.60, 0.40, 0.30)  # linear light, as glTF counts
@@ -153,7 +153,7 @@ def _check(rig: Rig, clips: Sequence[Clip], influences: int) -> None:
 def _joint_nodes(rig: Rig) -> list[Any]:
     import pygltflib
 
-    rotations = _quaternions(rig.rotations[None])[0]
+    rotations = rotation_quaternions(rig.rotations[None])[0]
     return [
         pygltflib.Node(
             name=name,
@@ -248,7 +248,7 @@ def _animation(rig: Rig, clip: Clip, store: _Store) -> Any:
         number = len(animation.samplers) - 1
         animation.channels.append(pygltflib.AnimationChannel(sampler=number, target=target))
 
-    rotations = _quaternions(clip.rotations)
+    rotations = rotation_quaternions(clip.rotations)
     shifts = np.abs(clip.translations - rig.translations).max((0, 2))
     for joint in range(rig.tree.num_joints):
         channel(joint, "rotation", rotations[:, joint])
@@ -257,16 +257,3 @@ def _animation(rig: Rig, clip: Clip, store: _Store) -> Any:
     if rig.target_names:
         channel(rig.tree.num_joints, "weights", clip.coefficients.reshape(-1))
     return animation
-
-
-def _quaternions(matrices: Float[np.ndarray, "T J 3 3"]) -> Float[np.ndarray, "T J 4"]:
-    """Unit quaternions, x y z w, of which each is the nearer of the two to the frame before."""
-    from scipy.spatial.transform import Rotation
-
-    matrices = np.array(matrices, np.float64)  # SciPy refuses read-only arrays
-    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
-    quaternions = quaternions.reshape(*matrices.shape[:2], 4)
-    turned = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
-    sign = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
-    quaternions[1:] *= sign[..., None]
-    return quaternions.astype(np.float32)

@@ -107,6 +107,19 @@ def joint_worlds(
     return world
 
 
+def rotation_quaternions(matrices: Float[np.ndarray, "T J 3 3"]) -> Float[np.ndarray, "T J 4"]:
+    """Unit quaternions, x y z w, of which each is the nearer of the two to the frame before."""
+    from scipy.spatial.transform import Rotation
+
+    matrices = np.array(matrices, np.float64)  # SciPy refuses read-only arrays
+    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
+    quaternions = quaternions.reshape(*matrices.shape[:2], 4)
+    turned = (quaternions[1:] * quaternions[:-1]).sum(-1) < 0
+    sign = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
+    quaternions[1:] *= sign[..., None]
+    return quaternions.astype(np.float32)
+
+
 def _check_shapes(what: str, owner: object, shapes: dict[str, tuple[int, ...]]) -> None:
     for name, expected in shapes.items():
         found = np.shape(getattr(owner, name))

@@ -166,6 +166,47 @@ def part_view(
     return _fit(checked, toward, vertical, fov, aspect, margin)
 
 
+def orbit_views(
+    points: ArrayLike,
+    count: int,
+    *,
+    aspect: float = 1.0,
+    margin: float = 1.08,
+    up: Vector = (0.0, 1.0, 0.0),
+    forward: Vector = (0.0, 0.0, 1.0),
+    elevation: float = math.radians(8.0),
+    fov: float = math.radians(22.0),
+) -> list[Camera]:
+    """`count` cameras on a circle about `points` (N, 3), the first in front, at one distance.
+
+    All points are in all pictures, about the same middle. The camera goes to the person's left
+    first. Other arguments are those of `frame_view`.
+
+    Raises:
+        ValueError: if there are no points.
+    """
+    checked = check_points(points)
+    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    ahead = np.asarray(forward, dtype=np.float64)
+    ahead = ahead - (ahead @ vertical) * vertical
+    ahead /= np.linalg.norm(ahead)
+    left = np.cross(vertical, ahead)
+    ways = [
+        math.cos(elevation) * (math.cos(turn) * ahead + math.sin(turn) * left)
+        + math.sin(elevation) * vertical
+        for turn in 2.0 * math.pi * np.arange(count) / count
+    ]
+    if len(checked) == 0:
+        raise ValueError("no points to look at: there is nothing to frame.")
+    middle = 0.5 * (checked.min(axis=0) + checked.max(axis=0))
+    slopes = math.tan(0.5 * fov) / margin * np.array([aspect, 1.0])
+    distance = 1e-3
+    for way in ways:
+        seen = (checked - middle) @ Camera.look_at(middle + way, middle, up=up).rotation.T
+        distance = max(distance, float((np.abs(seen[:, :2]) / slopes - seen[:, 2:]).max()))
+    return [Camera.look_at(middle + distance * way, middle, up=up, fov=fov) for way in ways]
+
+
 def _fit(
     points: Float[np.ndarray, "N 3"],
     direction: Float[np.ndarray, "3"],

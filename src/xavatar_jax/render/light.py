@@ -11,7 +11,7 @@ _KEY, _KEY_COLOR = np.array([-0.55, 0.75, 0.75]), np.array([1.95, 1.88, 1.78])
 _FILL, _FILL_COLOR = np.array([0.9, 0.15, 0.55]), np.array([0.26, 0.29, 0.34])
 _RIM, _RIM_COLOR = np.array([0.5, 0.55, -0.9]), np.array([0.42, 0.44, 0.48])
 _SKY_COLOR, _FLOOR_COLOR = np.array([0.62, 0.64, 0.68]), np.array([0.36, 0.34, 0.32])
-_SKY_RAYS, _KEY_RAYS = 32, 10
+SKY_RAYS, _KEY_RAYS = 16, 6
 
 
 def light_frame(camera: Camera) -> Float[np.ndarray, "3 3"]:

@@ -1,0 +1,128 @@
+"""Times of pictures and of the viewer, for one avatar; and the pictures of docs/view-and-render.md.
+
+python benchmarks/view_and_render.py out/fit_grab/avatar.npz
+python benchmarks/view_and_render.py out/fit_grab/avatar.npz --pictures docs/pictures
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import urllib.request
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import xavatar_jax as xa
+from xavatar_jax.geometry import closest_points
+from xavatar_jax.render import (
+    color_bar,
+    error_colors,
+    frame_view,
+    grid_picture,
+    render_mesh,
+    save_png,
+    turntable,
+    weight_colors,
+)
+
+SKIN = (0.80, 0.66, 0.57)
+
+
+def clock(work: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
+    """Least wall time and least processor time of a few calls after a first one, seconds."""
+    work()
+    times = []
+    for _ in range(repeats):
+        wall, processor = time.perf_counter(), time.process_time()
+        work()
+        times.append((time.perf_counter() - wall, time.process_time() - processor))
+    return min(t[0] for t in times), min(t[1] for t in times)
+
+
+def tell(name: str, seconds: tuple[float, float]) -> None:
+    print(f"{name}: {1000 * seconds[0]:.0f} ms, {1000 * seconds[1]:.0f} ms of processor time")
+
+
+def measure_pictures(mesh: xa.Mesh) -> None:
+    """Pictures of one mesh: normals, rays and shadows are computed anew for each."""
+    bare = replace(mesh, normals=None)
+    for name, size, ground in (
+        ("512 x 512", (512, 512), False),
+        ("512 x 512 with ground", (512, 512), True),
+        ("1920 x 1080 with ground", (1920, 1080), True),
+    ):
+        camera = frame_view(mesh.vertices, "three_quarter", aspect=size[0] / size[1])
+        tell(
+            f"picture, {name}",
+            clock(lambda c=camera, s=size, g=ground: render_mesh(bare, c, s, ground=g)),
+        )
+    wall, processor = clock(lambda: turntable(bare, 8, (1920, 1080)), 2)
+    tell("turntable, 1920 x 1080, a picture of 8", (wall / 8, processor / 8))
+
+
+def measure_viewer(avatar: xa.Avatar, frames: xa.Frames) -> None:
+    """From the call to the page, and from a slider to the new mesh on its way to the browser."""
+    begun = time.perf_counter()
+    with xa.view(avatar, frames=frames, verbose=False) as viewer:
+        urllib.request.urlopen(viewer.url).read()
+        print(f"viewer: page after {time.perf_counter() - begun:.1f} s", end="")
+        viewer.wait_until_shown()
+        print(f", avatar after {time.perf_counter() - begun:.1f} s")
+        joint = avatar.body.tree.index("left_elbow")
+
+        def slide(degrees: list[float] = [0.0]) -> None:  # noqa: B006
+            degrees[0] += 1.0
+            viewer.panel.set_turn(joint, (0.0, degrees[0], 0.0))
+            wish = viewer.panel.wish()
+            while viewer.shown != wish:
+                time.sleep(0.001)
+
+        tell("viewer, slider to moved mesh", clock(slide, 20))
+
+
+def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> None:
+    """Four ways to look at one frame."""
+    camera = frame_view(mesh.vertices, "three_quarter", aspect=0.62)
+    distance, _, _ = closest_points(frame.vertices, frame.faces, mesh.vertices)
+    weights = weight_colors(np.asarray(avatar.posable.weights).T)
+    ways = {
+        "color": (mesh, "color"),
+        "normal": (mesh, "normal"),
+        "weights": (replace(mesh, colors=weights), "error"),
+        "error": (replace(mesh, colors=error_colors(1000 * distance, 2.0)), "error"),
+    }
+    row = [
+        render_mesh(shown, camera, (310, 500), shading=shading, base_color=SKIN, ground=True)
+        for shown, shading in ways.values()
+    ]
+    sheet = grid_picture([[*row, color_bar(2.0, (70, 500))]], column_labels=[*ways, ""], gap=4)
+    save_png(folder / "shadings.png", sheet)
+    save_png(
+        folder / "turntable.png",
+        grid_picture([turntable(mesh, 6, (210, 420), base_color=SKIN)], gap=0),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("avatar", type=Path)
+    parser.add_argument("--pictures", type=Path, help="folder to draw into")
+    parser.add_argument("--no-viewer", action="store_true", help="measure pictures alone")
+    options = parser.parse_args()
+    avatar = xa.load_avatar(options.avatar)
+    frames = xa.synthetic_capture(body=avatar.body).test.sequences["signs_and_piano"]
+    if not options.no_viewer:
+        measure_viewer(avatar, frames)
+    frame = frames[len(frames) // 2]
+    mesh = avatar.animate(frame.params)[0].compute_normals()
+    if options.pictures is not None:
+        draw(avatar, frame, mesh, options.pictures)
+    measure_pictures(mesh)
+
+
+if __name__ == "__main__":
+    main()
