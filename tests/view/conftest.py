@@ -10,7 +10,7 @@ import pytest
 import xavatar_jax as xa
 from xavatar_jax.avatar import CellSizes
 from xavatar_jax.fields import GridSpacing
-from xavatar_jax.training.prefit import initial_fields
+from xavatar_jax.training import prefit
 
 
 @pytest.fixture(scope="session")
@@ -19,7 +19,9 @@ def avatar(bundled_body, tmp_path_factory) -> xa.Avatar:
     coarse = GridSpacing(body=0.03, hands=0.0075, face=0.01, band=0.06)
     config = replace(config, prefit_steps=60, skinning=replace(config.skinning, grid=coarse))
     cache = tmp_path_factory.mktemp("prefit")
-    fields = initial_fields(bundled_body, config, cache=cache, verbose=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prefit, "_POINTS", 60_000)  # a rough person is enough
+        fields = prefit.initial_fields(bundled_body, config, cache=cache, verbose=False)
     made = xa.Avatar(bundled_body, np.zeros(10, np.float32), fields, config)
     # What is shown of the surface is the same whatever its cells, and these take a second.
     made.__dict__["_base_mesh"] = made.canonical_mesh(cell=CellSizes().scaled(2.5))

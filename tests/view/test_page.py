@@ -99,8 +99,8 @@ def test_page_needs_nothing_from_elsewhere(file):
 
 
 def test_page_in_the_browser_shows_what_the_renderer_shows(avatar, motion, page):
-    page.run("avatar.state.time = 5; avatar.state.shading = 'avatar'; avatar.redraw()")
     drawn = page.run("avatar.state.drawn")
+    page.run("avatar.state.time = 5; avatar.state.shading = 'avatar'; avatar.redraw()")
     page.wait_for(f"avatar.state.drawn > {drawn}")
     view = page.run(
         "({eye: avatar.state.view.eye, target: avatar.state.target, fov: avatar.rig.fov})"

@@ -11,9 +11,10 @@ from .camera import Camera
 from .light import SKY_RAYS, key_visibility, openness, to_linear
 from .rays import Hits, RayScene
 
-# Of many vertices every second is asked, and averages fill in the others.
-_MANY = 8000
-_SMOOTHINGS = 2
+# Of more vertices than this, and one more for so many rays, only some are asked what they see:
+# averages over neighbours fill in the others.
+_MANY, _RAYS_A_VERTEX = 8000, 20
+_SMOOTHINGS = 3
 
 
 class Points(NamedTuple):
@@ -73,7 +74,8 @@ class Subject:
         marked = np.zeros(self.mesh.num_vertices, dtype=bool)
         marked[faces.reshape(-1)] = True
         used = np.flatnonzero(marked)
-        asked = used[used % 2 == 0] if len(used) > _MANY else used
+        every = 1 + len(used) // (_MANY + len(hits.ray) // _RAYS_A_VERTEX)
+        asked = used[used % every == 0]
         lift = 2e-3 * self.extent
         points = self.mesh.vertices.astype(np.float32)
         outward = self._channels[:, :3]
@@ -87,15 +89,15 @@ class Subject:
                 reach=0.25 * self.extent,
                 lift=lift,
             )
-        key = np.full(self.mesh.num_vertices, np.nan, dtype=np.float32)
-        key[asked] = key_visibility(
+        both = np.full((self.mesh.num_vertices, 2), np.nan, dtype=np.float32)
+        both[asked, 0] = self._sky[asked]
+        both[asked, 1] = key_visibility(
             self.scene, points[asked], outward[asked], camera, reach=self.extent, lift=lift
         )
-        both = np.stack([self._sky[used], key[used]], axis=1)
         number = np.zeros(self.mesh.num_vertices, dtype=np.int32)
         number[used] = np.arange(len(used), dtype=np.int32)
         spread = np.ones((self.mesh.num_vertices, 2), dtype=np.float32)
-        spread[used] = _smoothed(both, number[faces], _SMOOTHINGS)
+        spread[used] = _smoothed(both[used], number[faces], _SMOOTHINGS)
         found = self._at_hits(spread, hits)
         return found[:, 0], found[:, 1]
 

@@ -8,7 +8,6 @@ import json
 import os
 import zlib
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
@@ -206,7 +205,7 @@ def _about(rig: Rig, clip: Clip) -> str:
 
 def fill_template(manifest: dict[str, Any], blob: bytes, title: str) -> str:
     """Style, scripts and data put into the page."""
-    folder = resources.files("xavatar_jax.view") / "web"
+    folder = Path(__file__).parent / "web"
 
     def read(name: str) -> str:
         return (folder / name).read_text(encoding="utf-8")
