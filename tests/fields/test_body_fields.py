@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from xavatar_jax.body import BodyParams, canonical_joints
 from xavatar_jax.fields import (
+    ExpressionGrid,
     GridSpacing,
     HashGeometry,
     body_part_grids,
@@ -76,8 +77,12 @@ def geometry(bundled_body, vertices):
     joints = np.asarray(canonical_joints(bundled_body, jnp.zeros(0)), np.float64)
     hand = np.asarray(bundled_body.part_labels) == 2
     box = (vertices[hand].min(0) - 0.02, vertices[hand].max(0) + 0.02, 0.01)
+    face = vertices[np.isin(bundled_body.part_labels, (1, 4))]
+    expressive = ExpressionGrid(
+        face.min(0) - 0.05, face.max(0) + 0.05, spacing=0.02, num_expression=10, features=3
+    )
     return HashGeometry(
-        bundled_body.tree, joints, 10, vertices.min(0) - 0.1, vertices.max(0) + 0.1,
+        bundled_body.tree, joints, expressive, vertices.min(0) - 0.1, vertices.max(0) + 0.1,
         spacing=(0.1, 0.05, 0.02, 0.01), trunk_spacing=0.02, detail=(box,), features=2,
         log2_size=10, width=16, condition_width=6, sharpness=50.0, key=jax.random.key(0),
     )  # fmt: skip
@@ -99,11 +104,11 @@ def test_the_start_is_the_same_in_every_pose(bundled_body, vertices, geometry, r
 
 def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, geometry, rng):
     loud = eqx.tree_at(
-        lambda g: (g.pose_weights, g.expression_weights),
+        lambda g: (g.pose_weights, g.expressive.table),
         geometry,
         tuple(
             jnp.asarray(rng.normal(size=w.shape), jnp.float32)
-            for w in (geometry.pose_weights, geometry.expression_weights)
+            for w in (geometry.pose_weights, geometry.expressive.table)
         ),
     )
     run = jax.jit(jax.vmap(loud, in_axes=(0, None)))
@@ -121,7 +126,7 @@ def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, ge
     assert jaw[names.index("left_knee")] == 0
     assert jaw[names.index("left_index1")] == 0
     expression = change(params_of(bundled_body, expression=rng.normal(size=10)))
-    assert expression[names.index("head")] > 1e-4
+    assert expression[names.index("left_eye")] > 1e-4
     assert expression[names.index("left_foot")] == 0
     elbow = np.zeros((55, 3))
     elbow[names.index("left_elbow"), 1] = 1.0
@@ -130,6 +135,34 @@ def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, ge
     away = np.linalg.norm(joints - joints[names.index("left_elbow")], axis=1)
     assert elbow[names.index("left_elbow")] > 1e-4
     assert elbow[away > 6 * reach].max() < 1e-6
+
+
+def test_expressions_are_read_trilinearly_and_fade_out(rng):
+    """Linear functions of the place are given exactly, away from the edge of the box."""
+    low, high = np.array([-0.1, 0.2, 0.0]), np.array([0.1, 0.5, 0.22])
+    grid = ExpressionGrid(low, high, spacing=0.02, num_expression=2, features=3)
+    slope, middle = rng.normal(size=(3, 2, 3)), (low + high) / 2
+    axes = [low[k] + 0.02 * np.arange(grid.shape[k]) for k in range(3)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    table = jnp.asarray(np.einsum("nd,dek->nek", nodes - middle, slope), jnp.float32)
+    loud = eqx.tree_at(lambda g: g.table, grid, table)
+    inside = rng.uniform(low + 0.025, high - 0.025, (50, 3))
+    found = jax.vmap(loud)(jnp.asarray(inside, jnp.float32))
+    expected = np.einsum("nd,dek->nek", inside - middle, slope)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    halfway = jnp.asarray([low[0] + 0.01, *middle[1:]], jnp.float32)
+    edge = np.einsum("d,dek->ek", np.asarray(halfway) - middle, slope)
+    np.testing.assert_allclose(loud(halfway), 0.5 * edge, atol=1e-5)
+    assert not np.asarray(loud(jnp.asarray(low - 0.001, jnp.float32))).any()
+    assert not np.asarray(loud(jnp.asarray(high + np.array([0, 0.05, 0]), jnp.float32))).any()
+
+
+def test_motions_may_have_fewer_expression_coefficients_or_more(bundled_body, geometry):
+    for count in (3, 10):
+        params = BodyParams.create(bundled_body, expression=np.ones(count))
+        condition = geometry.condition(params)
+        assert condition.expression.shape == (10,)
+        assert float(condition.expression.sum()) == count
 
 
 def test_fine_levels_are_heard_inside_their_boxes_alone(geometry):
@@ -157,6 +190,6 @@ def test_geometry_gradients_reach_every_part(bundled_body, vertices, geometry, r
         return jnp.sum(jax.vmap(field, in_axes=(0, None))(points, field.condition(params)) ** 2)
 
     gradient = slope(geometry)
-    for part in (gradient.encoding.table, gradient.pose_weights, gradient.expression_weights):
+    for part in (gradient.encoding.table, gradient.pose_weights, gradient.expressive.table):
         assert np.isfinite(part).all()
         assert np.abs(part).max() > 0

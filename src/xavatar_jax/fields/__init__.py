@@ -2,6 +2,7 @@
 
 from .encodings import HashEncoding as HashEncoding
 from .encodings import positional_encoding as positional_encoding
+from .expression import ExpressionGrid as ExpressionGrid
 from .fixed import AbstractFixedPoints as AbstractFixedPoints
 from .geometry import AbstractGeometryField as AbstractGeometryField
 from .geometry import HashGeometry as HashGeometry

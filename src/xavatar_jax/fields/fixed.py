@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _BATCH = 4096
+_EXACT = jax.lax.Precision.HIGHEST
 
 
 class AbstractFixedPoints(eqx.Module):
@@ -45,20 +46,26 @@ class FixedHash(AbstractFixedPoints):
 
     first: Float[Array, "N width"]
     nearness: Float[Array, "N J"]
-    from_condition: Float[Array, "width K"]
+    expressive: Float[Array, "N E K2"] | None
+    from_condition: Float[Array, "width K1"]
     hidden: tuple[Float[Array, "out in"], ...]
     biases: tuple[Float[Array, " out"], ...]
     sharpness: float = eqx.field(static=True)
 
-    def __call__(self, condition: Float[Array, "J K"]) -> Float[Array, " N"]:
-        h = self.first + _matmul(self.nearness, _matmul(condition, self.from_condition.T))
+    def __call__(self, condition: Any) -> Float[Array, " N"]:
+        joints, expression = condition
+        weight, width = self.from_condition, joints.shape[-1]
+        h = self.first + _matmul(self.nearness, _matmul(joints, weight[:, :width].T))
+        if self.expressive is not None:
+            heard = jnp.einsum("nek,e->nk", self.expressive, expression, precision=_EXACT)
+            h = h + _matmul(heard, weight[:, width:].T)
         for weight, bias in zip(self.hidden, self.biases, strict=True):
             h = _matmul(_softplus(h, self.sharpness), weight.T) + bias
         return h[:, 0]
 
 
 def _matmul(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+    return jnp.matmul(a, b, precision=_EXACT)
 
 
 # log(1 + u) for u from 0 to 1, to 6e-9: three times as fast as the library's own.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..body import BodyParams, pose_groups
 from ..kinematics import KinematicTree, axis_angle_to_matrix
 from .encodings import HashEncoding
+from .expression import ExpressionGrid
 from .fixed import AbstractFixedPoints, FixedHash, FixedPoints
 from .mlp import ImplicitMLP, MLPShape
 
@@ -66,20 +67,28 @@ class MLPGeometry(AbstractGeometryField):
         return out[0]
 
 
+class LocalCondition(NamedTuple):
+    """Features of each joint's rotation `(J, K)`, and expression coefficients `(E,)`."""
+
+    joints: Float[Array, "J K"]
+    expression: Float[Array, " E"]
+
+
 class HashGeometry(AbstractGeometryField):
-    """Feature grids and a small MLP, with a condition that is local to each joint.
+    """Feature grids and a small MLP, with a condition that is local.
 
     A joint's rotation changes shape near that joint only: its features, linear in the entries of
     the rotation less the identity (as pose blend shapes are), fade with the distance from the
-    joint over half the length of the bones that meet there. Expression reaches what hangs from
-    the head. Levels finer than the trunk needs are heard inside the boxes of `detail` alone.
+    joint over half the length of the bones that meet there. Expression reaches the face alone, by
+    an `ExpressionGrid` in its box. Levels finer than the trunk needs are heard inside the boxes
+    of `detail` alone.
     """
 
     encoding: HashEncoding
     hidden: tuple[Float[Array, "out in"], ...]
     biases: tuple[Float[Array, " out"], ...]
     pose_weights: Float[Array, "J 9 K"]
-    expression_weights: Float[Array, "E K"]
+    expressive: ExpressionGrid | None
     joints: Float[Array, "J 3"]
     reach: tuple[float, ...] = eqx.field(static=True)
     detail_low: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
@@ -93,7 +102,7 @@ class HashGeometry(AbstractGeometryField):
         self,
         tree: KinematicTree,
         joints: Float[np.ndarray, "J 3"],
-        num_expression: int,
+        expressive: ExpressionGrid | None,
         low: Float[np.ndarray, "3"],
         high: Float[np.ndarray, "3"],
         *,
@@ -111,7 +120,8 @@ class HashGeometry(AbstractGeometryField):
         self.encoding = HashEncoding(
             low, high, spacing=spacing, features=features, log2_size=log2_size, key=keys[0]
         )
-        fan_in = (self.encoding.width + condition_width, width, width)
+        heard = 0 if expressive is None else expressive.table.shape[-1]
+        fan_in = (self.encoding.width + condition_width + heard, width, width)
         fan_out = (width, width, 1)
         self.hidden = tuple(
             jax.random.normal(k, (m, n)) * np.sqrt(2 / n)
@@ -120,7 +130,7 @@ class HashGeometry(AbstractGeometryField):
         self.biases = tuple(jnp.zeros(m) for m in fan_out)
         # Silent at first: the start is the same surface in every pose.
         self.pose_weights = jnp.zeros((tree.num_joints, 9, condition_width))
-        self.expression_weights = jnp.zeros((num_expression, condition_width))
+        self.expressive = expressive
         self.joints = jnp.asarray(joints, jnp.float32)
         self.reach = _joint_reach(tree, joints)
         self.detail_low = _triples([box[0] for box in detail])
@@ -130,14 +140,15 @@ class HashGeometry(AbstractGeometryField):
         self.sharpness = sharpness
         self.tree = tree
 
-    def condition(self, params: BodyParams) -> Float[Array, "J K"]:
-        """One row a joint, so that a point's condition is its weights times these rows."""
+    def condition(self, params: BodyParams) -> LocalCondition:
+        """A row for each joint, so that a point's condition is its nearness times these rows."""
         rotations = axis_angle_to_matrix(params.pose)
         feature = (rotations - jnp.eye(3, dtype=rotations.dtype)).reshape(-1, 9).at[0].set(0)
         rows = jnp.einsum("jf,jfk->jk", feature, self.pose_weights)
-        head = self.tree.indices("head")
-        reached = self.tree.subtree(head[0]) if head else range(self.tree.num_joints)
-        return rows.at[np.asarray(reached)].add(params.expression @ self.expression_weights)
+        # A motion may have fewer coefficients than the person's capture had, or more.
+        known = 0 if self.expressive is None else self.expressive.table.shape[1]
+        given = params.expression[:known]
+        return LocalCondition(rows, jnp.pad(given, (0, known - len(given))))
 
     def at(self, points: Float[Array, "N 3"]) -> FixedHash:
         features = jax.vmap(self._features)(points)
@@ -147,15 +158,18 @@ class HashGeometry(AbstractGeometryField):
         return FixedHash(
             first=first + bias,
             nearness=jax.vmap(self._nearness)(points),
+            expressive=None if self.expressive is None else jax.vmap(self.expressive)(points),
             from_condition=weight[:, width:],
             hidden=self.hidden[1:],
             biases=self.biases[1:],
             sharpness=self.sharpness,
         )
 
-    def __call__(self, x_c: Float[Array, "3"], condition: Float[Array, "J K"]) -> Float[Array, ""]:
-        local = self._nearness(x_c) @ condition
-        h = jnp.concatenate([self._features(x_c), local])
+    def __call__(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, ""]:
+        h = [self._features(x_c), self._nearness(x_c) @ condition.joints]
+        if self.expressive is not None:
+            h.append(condition.expression @ self.expressive(x_c))
+        h = jnp.concatenate(h)
         last = len(self.hidden) - 1
         for k, (weight, bias) in enumerate(zip(self.hidden, self.biases, strict=True)):
             h = weight @ h + bias

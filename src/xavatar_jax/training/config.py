@@ -27,7 +27,8 @@ class GeometryConfig:
     """`hash`: feature grids and a small MLP; `mlp`: the paper's network.
 
     `spacing` is the node distance of each level in metres; levels finer than `trunk` are heard
-    at hands (down to `hands`) and face (down to `face`) only.
+    at hands (down to `hands`) and face (down to `face`) only. Expression is heard at the face, by
+    `expression_features` on a grid of `expression_spacing`.
     """
 
     kind: Literal["hash", "mlp"] = "hash"
@@ -39,6 +40,8 @@ class GeometryConfig:
     log2_size: int = 17
     width: int = 64
     condition: int = 16
+    expression_spacing: float = 0.012
+    expression_features: int = 4
     sharpness: float = 10.0
     box_margin: float = 0.25
     mlp: MLPShape = MLPShape()

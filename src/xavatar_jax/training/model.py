@@ -14,6 +14,7 @@ from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_joints, ca
 from ..fields import (
     AbstractGeometryField,
     AbstractSkinningField,
+    ExpressionGrid,
     GridSkinning,
     HashGeometry,
     MLPGeometry,
@@ -67,10 +68,20 @@ def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGe
         own = vertices[np.isin(labels, members)]
         if len(own):
             detail.append((own.min(0) - _DETAIL_MARGIN, own.max(0) + _DETAIL_MARGIN, spacing))
+    expressive = None
+    if expression and np.isin(labels, FACES).any():
+        low, high, _ = detail[-1]
+        expressive = ExpressionGrid(
+            low,
+            high,
+            spacing=config.expression_spacing,
+            num_expression=expression,
+            features=config.expression_features,
+        )
     return HashGeometry(
         body.tree,
         np.asarray(canonical_joints(body, jnp.zeros(0, body.template.dtype))),
-        expression,
+        expressive,
         vertices.min(0) - config.box_margin,
         vertices.max(0) + config.box_margin,
         spacing=config.spacing,

@@ -26,7 +26,7 @@ from .config import FitConfig
 from .model import AvatarFields, fresh_fields, trainable_filter
 from .progress import progress
 
-_REVISION = 2  # raised when the fit below changes: it keys the cache
+_REVISION = 3  # raised when the fit below changes: it keys the cache
 _POINTS = 400_000
 _BATCH, _NETWORK_BATCH = 8192, 2048  # a network costs a hundred times more a point
 
