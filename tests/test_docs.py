@@ -363,7 +363,7 @@ def public_names() -> dict[str, set[str]]:
         dotted = ".".join(file.parent.relative_to(source.parent).parts)
         aliases = [
             alias.name
-            for node in ast.parse(read(file)).body
+            for node in ast.walk(ast.parse(read(file)))  # the package's own stand in a branch
             if isinstance(node, ast.ImportFrom)
             for alias in node.names
             if alias.asname == alias.name and not alias.name.startswith("_")

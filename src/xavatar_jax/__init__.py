@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from .training import FitConfig as FitConfig
     from .training import paper as paper
     from .training import quick as quick
-    from .view import HtmlPage as HtmlPage
-    from .view import Viewer as Viewer
-    from .view import view as view
-    from .view import view_html as view_html
+    from .viewer import HtmlPage as HtmlPage
+    from .viewer import Viewer as Viewer
+    from .viewer import view as view
+    from .viewer import view_html as view_html
 
 # What is imported on first use, so that `xavatar --help` does not wait for JAX.
 _HOMES = {
@@ -67,7 +67,7 @@ _HOMES = {
     "meshing": ("Mesh",),
     "motion": ("Motion", "MotionNotice", "concat", "load_motion", "save_motion"),
     "training": ("FitConfig", "paper", "quick"),
-    "view": ("HtmlPage", "Viewer", "view", "view_html"),
+    "viewer": ("HtmlPage", "Viewer", "view", "view_html"),
 }
 _NAMES = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import ArrayLike
 
-# Weight 0, one half and 1.
 WEIGHT_RAMP = np.array([[206, 208, 212], [246, 166, 72], [176, 32, 44]], dtype=np.uint8)
+"""Colours of weight 0, one half and 1."""
 
 
 def bone_palette(count: int) -> UInt8[np.ndarray, "J 3"]:

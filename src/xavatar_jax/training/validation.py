@@ -74,17 +74,22 @@ def _loss(
 
 @dataclass
 class Best:
-    """The fields with the least loss on the validation frames, and when there was a gain."""
+    """The fields with the least loss on the validation frames, and when there was a gain.
+
+    Of losses that differ by less than a gain, the latest counts: its rate was lower.
+    """
 
     loss: float = float("inf")
     step: int = 0
     learned: Any = None
+    least: float = float("inf")
     mark: float = float("inf")
     gained: int = 0
 
     def update(self, step: int, loss: float, learned: Any, config: ValidationConfig) -> None:
         """Take the fields if their loss is the least so far; note a gain worth waiting for."""
-        if loss < self.loss:
+        self.least = min(self.least, loss)
+        if loss <= self.least * (1 + config.gain):
             self.loss, self.step = loss, step
             self.learned = jax.tree.map(jnp.copy, learned)
         # The first loss is a gain over none, whatever the share asked for.
@@ -107,4 +112,5 @@ class Best:
 
     def to_dict(self) -> dict[str, float]:
         """Plain values without the fields."""
-        return {"loss": self.loss, "step": self.step, "mark": self.mark, "gained": self.gained}
+        names = ("loss", "step", "least", "mark", "gained")
+        return {name: getattr(self, name) for name in names}

@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import xavatar_jax as xa
-from view.browser import open_browser
+from viewer.browser import open_browser
 from xavatar_jax.render import Camera, render_mesh
-from xavatar_jax.view import view_html
+from xavatar_jax.viewer import view_html
 
 READY = "!!(window.avatar && avatar.state.drawn > 0)"
 

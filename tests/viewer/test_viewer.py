@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import xavatar_jax as xa
-from view.browser import open_browser
+from viewer.browser import open_browser
 from xavatar_jax.frames import frames_from_params
-from xavatar_jax.view.poses import facing, frame_of, joint_choices, turned
-from xavatar_jax.view.surfaces import ERROR, NORMALS, TRUTH, WEIGHTS, Surfaces, Wish
+from xavatar_jax.viewer.poses import facing, frame_of, joint_choices, turned
+from xavatar_jax.viewer.surfaces import ERROR, NORMALS, TRUTH, WEIGHTS, Surfaces, Wish
 
 
 @pytest.fixture(scope="module")
