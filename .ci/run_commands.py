@@ -65,6 +65,7 @@ HOW = {
     f"{_XAVATAR} animate {_AVATAR} bundled --out out/animation.webp": skip(
         "the same with another motion is run"
     ),
+    f"{_XAVATAR} view {_AVATAR} bundled --open": skip("runs until Ctrl-C; tests/viewer"),
     f"{_XAVATAR} export {_AVATAR} bundled --out out/avatar.glb": skip(
         "the same with two motions is run"
     ),

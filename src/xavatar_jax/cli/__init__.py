@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": "compare an avatar with meshes it has not seen",
     "animate": "pictures of an avatar that follows a motion",
     "export": "rigged GLB, meshes, sequences of meshes, skinning weights",
+    "view": "an avatar in the browser, or one page that plays anywhere",
     "convert": "a motion from one file format to another",
     "info": "this machine, or what is in a file",
 }
