@@ -80,8 +80,8 @@ def on_four_devices(*arguments: object) -> dict:
 @pytest.mark.parametrize(
     ("preset", "frames", "held", "mesh"),
     [
-        ("quick", 4, 0, {"frames": 4, "points": 1}),
-        ("paper", 2, 1, {"frames": 2, "points": 2}),
+        ("quick", 4, 1, {"frames": 4, "points": 1}),
+        ("paper", 2, 0, {"frames": 2, "points": 2}),
     ],
 )
 def test_four_devices_give_the_losses_of_one(case, tmp_path, preset, frames, held, mesh):
