@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import os
@@ -38,6 +39,10 @@ def chromium() -> str:
     return found
 
 
+class PageError(AssertionError):
+    """The browser could not do what it was asked."""
+
+
 class Page:
     """One open page: runs scripts, takes pictures, keeps what the console said."""
 
@@ -55,7 +60,8 @@ class Page:
         while True:
             message = json.loads(self._socket.recv(timeout=120))
             if message.get("id") == self._count:
-                assert "error" not in message, message
+                if "error" in message:
+                    raise PageError(f"{method}: {message['error']}; {self.console}")
                 return message["result"]
             self._keep(message)
 
@@ -103,9 +109,11 @@ class Page:
         """The first picture that is good."""
         end = time.monotonic() + seconds
         while True:
-            picture = self.picture()
-            if good(picture):
-                return picture
+            # A page that is just being replaced by the next one has no picture.
+            with contextlib.suppress(PageError):
+                picture = self.picture()
+                if good(picture):
+                    return picture
             assert time.monotonic() < end, f"no such picture after {seconds} s; {self.console}"
 
 
