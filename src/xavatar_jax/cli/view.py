@@ -26,9 +26,9 @@ class Options:
 
     avatar: Positional[Path]
     """Avatar file, as `xavatar fit` writes it."""
-    motion: Positional[Path | None] = None
+    motion: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
     """What it is to do; without one it stands at rest."""
-    html: Annotated[Path | None, arg(metavar="FILE.html")] = None
+    html: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """Write one page that needs no server and no network, in place of a viewer."""
     port: int = 8080
     """Of the page; the next free one if it is taken."""
