@@ -103,7 +103,7 @@ def page_text(
     scales = expression_scales(avatar, [animation])
     rig = build_rig(avatar, scales)
     clip = build_clip("motion", animation, rig, scales, axis)
-    manifest, blob = pack(rig, clip, scales)
+    manifest, blob = pack(rig, clip, np.zeros(0) if scales is None else scales)
     manifest |= _staging(animation, axis)
     manifest["about"] = _about(rig, clip)
     return fill_template(manifest, blob, title)
