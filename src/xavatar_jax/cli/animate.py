@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import Positional
 
-from .inputs import cut_motion, read_avatar, read_motion
-from .options import READING_NAMES, File, Flag, Number, Reading, Seconds, Target, arg
+from .inputs import read_avatar, read_stretch
+from .options import READING_NAMES, Driven, Number, Target, arg
 from .outputs import check_file, check_new_folder, written
 
 _FASTEST = 30.0  # more frames a second than this make files large and nothing better
@@ -18,7 +18,7 @@ SPOKEN = READING_NAMES
 
 
 @dataclass
-class Options:
+class Options(Driven):
     """Draw an avatar that follows a motion.
 
     MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of ours.
@@ -42,19 +42,8 @@ class Options:
     """fast: skin the canonical surface. full: extract every frame's own; slow."""
     offsets: Literal["cached", "exact", "none"] = "cached"
     """How the surface follows pose and expression in fast mode."""
-    fps: Number = None
+    fps: Number = field(default=None, kw_only=True)
     """Frames a second; without it the motion's own, 30 at most."""
-    start: Seconds = None
-    """Leave out what is before."""
-    end: Seconds = None
-    """Leave out what is after."""
-    body: File = None
-    """The body model, if it is not where the avatar was learned ("bundled": our own)."""
-    template: File = None
-    """The person's own template mesh, for an avatar that was learned on one."""
-    quiet: Flag = False
-    """No progress bars, no report."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options) -> None:
@@ -66,9 +55,7 @@ def run(options: Options) -> None:
     if min(options.size) < 1:
         raise ValueError(f"--size {options.size[0]} {options.size[1]}: at least one pixel a side")
     avatar = read_avatar(options.avatar, options.body, options.template)
-    motion = read_motion(options.motion, options.reading, avatar.body).to_y_up(avatar.body)
-    fps = min(motion.fps, _FASTEST) if options.fps is None else options.fps
-    motion = cut_motion(motion, options.start, options.end, fps)
+    motion = read_stretch(options.motion, options, avatar.body, fastest=_FASTEST)
     animation = avatar.animate(motion, mode=options.mode, offsets=options.offsets)
     pictures = motion_pictures(
         animation, size=options.size, view=options.view, shading=options.shading

@@ -6,20 +6,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import Positional
 
 import xavatar_jax as xa
 
-from .inputs import cut_motion, read_avatar, read_motion
+from .inputs import read_avatar, read_stretch
 from .options import (
     READING_NAMES,
     Count,
-    File,
-    Flag,
-    Number,
+    Driven,
     OptionalPaths,
-    Reading,
-    Seconds,
     Target,
 )
 from .outputs import check_file, check_new_folder, written
@@ -32,7 +28,7 @@ SPOKEN = READING_NAMES
 
 
 @dataclass
-class Options:
+class Options(Driven):
     """Write an avatar for other programs. The name of --out says what:
 
       FILE.glb            a rigged mesh, expressions as blend shapes, each MOTION a clip
@@ -57,19 +53,6 @@ class Options:
     """FOLDER: kind of the mesh files."""
     frame: Count = None
     """FILE.ply, FILE.obj: which frame of MOTION, from 0."""
-    fps: Number = None
-    """Frames a second; without it the motion's own."""
-    start: Seconds = None
-    """Leave out what is before."""
-    end: Seconds = None
-    """Leave out what is after."""
-    body: File = None
-    """The body model, if it is not where the avatar was learned ("bundled": our own)."""
-    template: File = None
-    """The person's own template mesh, for an avatar that was learned on one."""
-    quiet: Flag = False
-    """No progress bars, no report."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options) -> None:
@@ -108,8 +91,7 @@ def _motions(options: Options, avatar: Avatar) -> dict[str, Motion]:
     """Motions by the names that their clips get, y-up."""
     found: dict[str, Motion] = {}
     for path in options.motion:
-        motion = read_motion(path, options.reading, avatar.body).to_y_up(avatar.body)
-        motion = cut_motion(motion, options.start, options.end, options.fps)
+        motion = read_stretch(path, options, avatar.body)
         stem = Path(motion.source).stem or "motion"
         name, number = stem, 2
         while name in found:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import xavatar_jax as xa
 
-from .options import Reading
+from .options import Driven, Reading
 
 if TYPE_CHECKING:
     from ..avatar import Avatar
@@ -61,6 +61,20 @@ def read_motion(file: Path, reading: Reading, body: BodyModel | None) -> Motion:
         joint_map=reading.joint_map,
         scale=reading.scale,
     )
+
+
+def read_stretch(
+    file: Path, options: Driven, body: BodyModel, fastest: float | None = None
+) -> Motion:
+    """The stretch of a motion that the options ask for, y-up.
+
+    Without `--fps` it has its own frame rate, or `fastest` if that is lower.
+    """
+    motion = read_motion(file, options.reading, body).to_y_up(body)
+    fps = options.fps
+    if fps is None and fastest is not None:
+        fps = min(motion.fps, fastest)
+    return cut_motion(motion, options.start, options.end, fps)
 
 
 def cut_motion(motion: Motion, start: float | None, end: float | None, fps: float | None) -> Motion:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 T = TypeVar("T")
 
@@ -53,6 +53,25 @@ class Reading:
     """BVH: metres in one of its units, if not told by the length of the legs."""
 
 
+@dataclass(kw_only=True)
+class Driven:
+    """What commands share in which an avatar follows a motion: `inputs.read_stretch` reads it."""
+
+    fps: Number = None
+    """Frames a second; without it the motion's own."""
+    start: Seconds = None
+    """Leave out what is before."""
+    end: Seconds = None
+    """Leave out what is after."""
+    body: File = None
+    """The body model, if it is not where the avatar was learned ("bundled": our own)."""
+    template: File = None
+    """The person's own template mesh, for an avatar that was learned on one."""
+    quiet: Flag = False
+    """No progress bars, no report."""
+    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
+
+
 # Arguments of `load_motion` that have another name on the command line.
 READING_NAMES = {"format": "--read-as", "fps": "--file-fps", "up": "--file-up"}
 
@@ -74,14 +93,14 @@ def option_names(options: type) -> dict[str, str]:
     """Options of a command line by the names of their fields; positional ones are left out."""
     found: dict[str, str] = {}
     hints = get_type_hints(options, include_extras=True)
-    for field in fields(options):
-        kind = hints[field.name]
+    for entry in fields(options):
+        kind = hints[entry.name]
         inner = kind.__origin__ if hasattr(kind, "__metadata__") else kind
         marks = {repr(mark) for mark in getattr(kind, "__metadata__", ())}
-        if is_dataclass(inner):
-            found |= option_names(inner)  # type: ignore[arg-type]
+        if isinstance(inner, type) and is_dataclass(inner):
+            found |= option_names(inner)
         elif not marks & {"Positional", "Suppress"}:
-            found[field.name] = f"--{field.name.replace('_', '-')}"
+            found[entry.name] = f"--{entry.name.replace('_', '-')}"
     return found
 
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import Positional
 
-from .inputs import cut_motion, read_avatar, read_motion
-from .options import READING_NAMES, File, Flag, Number, Reading, Seconds, arg
+from .inputs import read_avatar, read_stretch
+from .options import READING_NAMES, Driven, Flag, OptionalPath, arg
 from .outputs import check_file, written
 
 SPOKEN = READING_NAMES
 
 
 @dataclass
-class Options:
+class Options(Driven):
     """Pose an avatar by sliders in the browser, or play a motion.
 
     MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of ours.
@@ -26,7 +26,7 @@ class Options:
 
     avatar: Positional[Path]
     """Avatar file, as `xavatar fit` writes it."""
-    motion: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
+    motion: OptionalPath = None
     """What it is to do; without one it stands at rest."""
     html: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """Write one page that needs no server and no network, in place of a viewer."""
@@ -36,19 +36,6 @@ class Options:
     """0.0.0.0 answers every machine of the network."""
     open: Flag = False
     """Open the page in the browser of this machine."""
-    fps: Number = None
-    """Frames a second, in place of the motion's own."""
-    start: Seconds = None
-    """Leave out what is before."""
-    end: Seconds = None
-    """Leave out what is after."""
-    body: File = None
-    """The body model, if it is not where the avatar was learned ("bundled": our own)."""
-    template: File = None
-    """The person's own template mesh, for an avatar that was learned on one."""
-    quiet: Flag = False
-    """No report."""
-    reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options) -> None:
@@ -60,8 +47,7 @@ def run(options: Options) -> None:
     avatar = read_avatar(options.avatar, options.body, options.template)
     motion = None
     if options.motion is not None:
-        motion = read_motion(options.motion, options.reading, avatar.body).to_y_up(avatar.body)
-        motion = cut_motion(motion, options.start, options.end, options.fps)
+        motion = read_stretch(options.motion, options, avatar.body)
     if options.html is not None:
         view_html(options.html, avatar, motion, title=options.avatar.stem)
         written(options.html, "a page that plays alone", quiet=options.quiet)
