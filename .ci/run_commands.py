@@ -72,6 +72,7 @@ HOW = {
     f"{_XAVATAR} export {_AVATAR} bundled --end 0.5 --out out/meshes": skip("tests/cli"),
     f"{_XAVATAR} export {_AVATAR} --out out/weights.npz": skip("tests/cli"),
     f"{_XAVATAR} view {_AVATAR} bundled --open": skip("runs until Ctrl-C; tests/viewer"),
+    "ssh -L 8080:localhost:8080 HOST": skip("takes another machine"),
     f"{_XAVATAR} export {_AVATAR} bundled --out out/avatar.glb": skip(
         "the same with two motions is run"
     ),

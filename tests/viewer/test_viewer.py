@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import xavatar_jax as xa
 from viewer.browser import open_browser
+from xavatar_jax.body import facing
 from xavatar_jax.frames import frames_from_params
-from xavatar_jax.viewer.poses import facing, frame_of, joint_choices, turned
+from xavatar_jax.viewer.poses import frame_of, joint_choices, turned
 from xavatar_jax.viewer.surfaces import ERROR, NORMALS, TRUTH, WEIGHTS, Surfaces, Wish
 
 

@@ -23,7 +23,7 @@ from ..export import (
     write_weights,
 )
 from ..files import atomic_path
-from ..kinematics import KinematicTree
+from ..kinematics import TO_Y_UP, KinematicTree
 from .animate import (
     Animation,
     MotionLike,
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 Motions = MotionLike | BodyParams | Mapping[str, MotionLike | BodyParams]
 _CHECKED_FRAMES = 24
-# The world's up axis turned to y: about x, so that x stays.
-_TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,10 +219,10 @@ def build_clip(
 
     **Raises:** `ValueError` for another up axis than y and z.
     """
-    if up not in _TO_Y_UP:
+    if up not in TO_Y_UP:
         raise ValueError(f"{name}: up axis {up!r}; it must be 'y' or 'z'")
     params, avatar = animation.params, animation.avatar
-    turn = _TO_Y_UP[up]
+    turn = TO_Y_UP[up]
     rotations = _matrices(np.asarray(params.pose))
     joints = jax.vmap(lambda p: rest_joints(avatar.body, p.betas, p.expression))(params)
     translations = _to_parent(rig.tree, np.asarray(joints, np.float64))

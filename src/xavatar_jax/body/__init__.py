@@ -4,6 +4,8 @@ from .adapter import body_from_model as body_from_model
 from .adapter import params_from_model as params_from_model
 from .hands import hands_to_absolute as hands_to_absolute
 from .hands import hands_to_relative as hands_to_relative
+from .heading import facing as facing
+from .heading import root_rotation as root_rotation
 from .joints import SMPL_TREE as SMPL_TREE
 from .joints import SMPLH_TREE as SMPLH_TREE
 from .joints import SMPLX_TREE as SMPLX_TREE

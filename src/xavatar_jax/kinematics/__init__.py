@@ -1,5 +1,6 @@
 """Rotations, forward kinematics and linear blend skinning on a bare tree of joints."""
 
+from .axes import TO_Y_UP as TO_Y_UP
 from .forward import forward_kinematics as forward_kinematics
 from .forward import relative_transforms as relative_transforms
 from .inverse import determinant_3x3 as determinant_3x3

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..body import rest_joints
+from ..kinematics import TO_Y_UP
 from .convert import shape_for
 
 if TYPE_CHECKING:
@@ -17,10 +18,7 @@ if TYPE_CHECKING:
     from .record import Motion, UpAxis
 
 # Rotations that carry one up axis to the other, about x, so that x stays.
-_TO_UP = {
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-}
+_TO_UP = {"y": TO_Y_UP["z"], "z": TO_Y_UP["z"].T}
 
 
 def rest_pelvis(body: BodyModel, betas: Float[np.ndarray, " S"]) -> Float[np.ndarray, 3]:

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..avatar import Animation, Avatar
-from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyParams
+from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyParams, facing
 from ..frames import Frame, Frames
 from ..geometry import closest_points
-from ..kinematics import axis_angle_to_matrix
 from ..meshing import Mesh
 from ..render import (
     Camera,
@@ -38,7 +37,7 @@ def preview(
     error = replace(mesh, colors=error_colors(1000 * distance, max_error_mm))
     labels = np.asarray(avatar.body.part_labels)
     template = avatar.posed_template(frame.params)
-    forward = _facing(frame.params)
+    forward = tuple(facing(frame.params))
     views: list[tuple[str, Camera, float]] = [
         ("body", frame_view(template, "three_quarter", forward=forward, aspect=0.8), 1.25)
     ]
@@ -75,7 +74,7 @@ def animation(
     """The avatar beside the truth, `count` frames of one sequence from a fixed camera."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
     params = frames[chosen].params
-    camera = frame_view(_reach(avatar, params), "front", forward=_facing(params[0]))
+    camera = frame_view(_reach(avatar, params), "front", forward=tuple(facing(params[0])))
     pictures = []
     meshes = avatar.animate(params)
     for k, mesh in zip(chosen, meshes, strict=True):
@@ -103,7 +102,7 @@ def motion_pictures(
     """
     width, height = (size, size) if isinstance(size, int) else size
     reach = _reach(animation.avatar, animation.params)
-    forward = _facing(animation.params[0])
+    forward = tuple(facing(animation.params[0]))
     camera = frame_view(reach, view, forward=forward, aspect=width / height)
     floor = float(reach[:, 1].min())
     for mesh in animation:
@@ -122,11 +121,3 @@ def _reach(avatar: Avatar, params: BodyParams, count: int = 8) -> Float[np.ndarr
     """Vertices of the body in frames spread over a motion, which a camera has to show."""
     chosen = np.unique(np.linspace(0, len(params) - 1, min(count, len(params))).astype(int))
     return np.concatenate([avatar.posed_template(params[int(k)]) for k in chosen])
-
-
-def _facing(params: BodyParams) -> tuple[float, float, float]:
-    """Where the person looks, along the ground: the root's rotation of +Z."""
-    forward = np.asarray(axis_angle_to_matrix(params.global_orient))[:, 2]
-    x, z = float(forward[0]), float(forward[2])
-    length = float(np.hypot(x, z))
-    return (0.0, 0.0, 1.0) if length < 1e-3 else (x / length, 0.0, z / length)

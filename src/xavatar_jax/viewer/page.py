@@ -17,11 +17,12 @@ from jaxtyping import Float
 from ..avatar import Avatar
 from ..avatar.animate import Animation, MotionLike, spread_frames
 from ..avatar.rigging import build_clip, build_rig, expression_scales
-from ..body import BodyParams
+from ..body import BodyParams, facing
 from ..export import Clip, Rig, limit_influences, rotation_quaternions
 from ..files import atomic_path
+from ..kinematics import TO_Y_UP
 from ..render import WEIGHT_RAMP, bone_palette
-from .poses import TO_Y_UP, UpAxis, facing, rest_params
+from .poses import UpAxis, rest_params
 
 _SKIN = (0.80, 0.66, 0.57)
 _INFLUENCES = 8

@@ -18,7 +18,6 @@ from ..body.joints import pose_groups
 from ..kinematics import KinematicTree
 
 UpAxis = Literal["y", "z"]
-TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])}
 UP: dict[str, tuple[float, float, float]] = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -27,23 +26,6 @@ def rest_params(avatar: Avatar) -> BodyParams:
     return BodyParams.create(
         avatar.body, transl=np.zeros((1, 3)), betas=np.asarray(avatar.betas)[None]
     )
-
-
-def root_rotation(params: BodyParams) -> Float[np.ndarray, "3 3"]:
-    """Orientation of the person of one frame in the world."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(np.array(params.pose[0], np.float64)).as_matrix()
-
-
-def facing(params: BodyParams, up: str = "y") -> Float[np.ndarray, "3"]:
-    """Where the person of one frame looks, along the ground: the root's rotation of +Z."""
-    ahead, vertical = root_rotation(params)[:, 2], np.asarray(UP[up])
-    ahead = ahead - (ahead @ vertical) * vertical
-    length = float(np.linalg.norm(ahead))
-    if length < 1e-3:
-        return TO_Y_UP[up].T @ np.array([0.0, 0.0, 1.0])
-    return ahead / length
 
 
 def turned(

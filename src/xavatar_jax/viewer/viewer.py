@@ -14,11 +14,11 @@ import numpy as np
 
 from ..avatar import Avatar
 from ..avatar.animate import DEFAULT_FPS, MotionLike
-from ..body import BodyParams
+from ..body import BodyParams, facing, root_rotation
 from ..frames import Frames
 from ..render import frame_view
 from .panel import Panel
-from .poses import UP, UpAxis, facing, frame_of, rest_params, root_rotation
+from .poses import UP, UpAxis, frame_of, rest_params
 from .stage import Stage
 from .surfaces import Surfaces, Wish
 
