@@ -116,6 +116,8 @@ def rest_vertices(
     return vertices
 
 
+# Compiled as wholes, here and below: step by step, a first call would compile a hundred programs.
+@eqx.filter_jit
 def pose_body(body: BodyModel, params: BodyParams) -> Posed:
     """Pose one frame; `jax.vmap(partial(pose_body, body))` poses many.
 
@@ -165,11 +167,13 @@ def canonical_params(body: BodyModel, betas: Float[Array, " S"] | None = None) -
     return BodyParams.create(body, pose=canonical_pose(body), betas=betas)
 
 
+@eqx.filter_jit
 def canonical_vertices(body: BodyModel, betas: Float[Array, " S"]) -> Float[Array, "V 3"]:
     """The body of this shape in the canonical pose, metres."""
     return pose_body(body, canonical_params(body, betas)).vertices
 
 
+@eqx.filter_jit
 def canonical_joints(body: BodyModel, betas: Float[Array, " S"]) -> Float[Array, "J 3"]:
     """Joints of the body of this shape in the canonical pose, metres."""
     joints = rest_joints(body, betas)
@@ -178,6 +182,7 @@ def canonical_joints(body: BodyModel, betas: Float[Array, " S"]) -> Float[Array,
     return moved + transforms[:, :3, 3]
 
 
+@eqx.filter_jit
 def bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "J 4 4"]:
     """Transforms of every bone from canonical space to one posed frame, translation included.
 

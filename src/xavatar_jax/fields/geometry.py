@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -123,10 +124,7 @@ class HashGeometry(AbstractGeometryField):
         heard = 0 if expressive is None else expressive.table.shape[-1]
         fan_in = (self.encoding.width + condition_width + heard, width, width)
         fan_out = (width, width, 1)
-        self.hidden = tuple(
-            jax.random.normal(k, (m, n)) * np.sqrt(2 / n)
-            for k, n, m in zip(keys[1:], fan_in, fan_out, strict=True)
-        )
+        self.hidden = _normal_layers(keys[1:], fan_in, fan_out)
         self.biases = tuple(jnp.zeros(m) for m in fan_out)
         # Silent at first: the start is the same surface in every pose.
         self.pose_weights = jnp.zeros((tree.num_joints, 9, condition_width))
@@ -196,6 +194,16 @@ class HashGeometry(AbstractGeometryField):
             inside = jnp.clip(depth / 0.02, 0, 1)
             mask = jnp.maximum(mask, inside * jnp.asarray(spacing >= finest * 0.999, x.dtype))
         return mask
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _normal_layers(
+    keys: PRNGKeyArray, fan_in: tuple[int, ...], fan_out: tuple[int, ...]
+) -> tuple[Float[Array, "out in"], ...]:
+    return tuple(
+        jax.random.normal(k, (m, n)) * np.sqrt(2 / n)
+        for k, n, m in zip(keys, fan_in, fan_out, strict=True)
+    )
 
 
 def _joint_reach(

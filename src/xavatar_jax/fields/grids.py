@@ -10,7 +10,7 @@ Cells near the body store their nodes; elsewhere a cell answers with the nearest
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -197,22 +197,23 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         node_count += len(unique)
         cell_count += 2 * len(flat)
         dense_count += near.size
-    all_nodes = np.concatenate(nodes)
-    grids = PartGrids(
+    all_nodes, all_cells = np.concatenate(nodes), np.concatenate(cells)
+    all_index = np.concatenate(index)
+    margins = _margins(nodes, boxes, all_cells, all_index, spacing)
+    return PartGrids(
         nodes=jnp.asarray(all_nodes, jnp.float32),
-        cells=jnp.asarray(np.concatenate(cells), jnp.int32),
+        cells=jnp.asarray(all_cells, jnp.int32),
         covered=jnp.asarray(np.concatenate(covered)),
-        index=jnp.asarray(np.concatenate(index), jnp.int32),
+        index=jnp.asarray(all_index, jnp.int32),
         origin=jnp.asarray(np.stack([b[0] for b in boxes]), jnp.float32),
         spacing=jnp.asarray([b[2] for b in boxes], jnp.float32),
         shape=jnp.asarray(np.stack([b[1] for b in boxes]), jnp.int32),
         offset=jnp.asarray(offsets, jnp.int32),
-        blend_nodes=jnp.zeros(0, jnp.int32),
-        blend_cells=jnp.zeros((0, 8), jnp.int32),
-        blend_lerp=jnp.zeros((0, 8), jnp.float32),
-        blend_share=jnp.zeros(0, jnp.float32),
+        blend_nodes=jnp.asarray(margins.nodes, jnp.int32),
+        blend_cells=jnp.asarray(margins.cells, jnp.int32),
+        blend_lerp=jnp.asarray(margins.lerp, jnp.float32),
+        blend_share=jnp.asarray(margins.share, jnp.float32),
     )
-    return _with_margins(grids, boxes, [len(n) for n in nodes], spacing)
 
 
 def _cells_near(
@@ -231,38 +232,39 @@ def _cells_near(
     return away * step <= band + step
 
 
-def _with_margins(
-    grids: PartGrids, boxes: list, counts: list[int], spacing: GridSpacing
-) -> PartGrids:
-    """Fine nodes near their box's border, with their place in the coarse grid."""
-    first = np.cumsum([0, *counts])
-    picked, shares = [], []
+class _Margins(NamedTuple):
+    """Fine nodes near their box's border, their coarse cell and place in it, and its share."""
+
+    nodes: Int[np.ndarray, " B"]
+    cells: Int[np.ndarray, "B 8"]
+    lerp: Float[np.ndarray, "B 8"]
+    share: Float[np.ndarray, " B"]
+
+
+def _margins(
+    nodes: list[Float[np.ndarray, "n 3"]],
+    boxes: list,
+    cells: Int[np.ndarray, "C 8"],
+    index: Int[np.ndarray, " dense"],
+    spacing: GridSpacing,
+) -> _Margins:
+    first = np.cumsum([0, *(len(n) for n in nodes)])
+    picked, places, shares = [np.zeros(0, int)], [np.zeros((0, 3))], [np.zeros(0)]
     for g in range(1, len(boxes)):
         origin, shape, step, _, _ = boxes[g]
-        nodes = np.asarray(grids.nodes[first[g] : first[g + 1]], np.float64)
-        local = nodes - origin
+        local = nodes[g] - origin
         depth = np.minimum(local, shape * step - local).min(1)
         t = np.clip(depth / (spacing.margin * spacing.body), 0, 1)
         share = 1 - t * t * (3 - 2 * t)
         rows = np.flatnonzero(share > 0)
         picked.append(rows + first[g])
+        places.append(nodes[g][rows])
         shares.append(share[rows])
-    if not picked:
-        return grids
-    rows = np.concatenate(picked)
-    # Look the nodes up in the coarse grid alone.
+    # Looked up in the coarse grid alone.
     origin, shape, step, _, _ = boxes[0]
-    u = (np.asarray(grids.nodes[rows], np.float64) - origin) / step
+    u = (np.concatenate(places) - origin) / step
     cell = np.clip(np.floor(u + 1e-6).astype(int), 0, shape - 1)
     flat = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
-    lerp = lerp_weights(jnp.asarray(np.clip(u - cell, 0, 1), jnp.float32))
-    return eqx.tree_at(
-        lambda t: (t.blend_nodes, t.blend_cells, t.blend_lerp, t.blend_share),
-        grids,
-        (
-            jnp.asarray(rows, jnp.int32),
-            grids.cells[grids.index[flat]],
-            lerp,
-            jnp.asarray(np.concatenate(shares), jnp.float32),
-        ),
-    )
+    fraction = np.clip(u - cell, 0, 1)[:, None, :]
+    lerp = np.where(CORNERS == 1, fraction, 1 - fraction).prod(-1)
+    return _Margins(np.concatenate(picked), cells[index[flat]], lerp, np.concatenate(shares))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -72,12 +73,16 @@ def template_grid_skinning(
     logits = hierarchical_logits(body.tree, weights)
     correction_grids = body_part_grids(body, vertices, correction_spacing)
     return GridSkinning(
-        template=grids.blend(jnp.asarray(logits, jnp.float32)),
+        template=_blend(grids, jnp.asarray(logits, jnp.float32)),
         correction=jnp.zeros((correction_grids.num_nodes, num_logits(body.tree)), jnp.float32),
         grids=grids,
         correction_grids=correction_grids,
         tree=body.tree,
     )
+
+
+_blend = eqx.filter_jit(PartGrids.blend)
+_locate = eqx.filter_jit(PartGrids.locate)
 
 
 def _smooth_away_from_surface(
@@ -86,7 +91,7 @@ def _smooth_away_from_surface(
     """Average with neighbours of the same grid; nodes of cells that the surface crosses stay."""
     from scipy.sparse import coo_array
 
-    cell, _, _ = grids.locate(jnp.asarray(vertices, jnp.float32))
+    cell, _, _ = _locate(grids, jnp.asarray(vertices, jnp.float32))
     fixed = np.zeros(len(weights), bool)
     fixed[np.asarray(grids.cells)[np.asarray(cell)].ravel()] = True
     free = np.flatnonzero(~fixed)
