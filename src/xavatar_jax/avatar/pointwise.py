@@ -41,14 +41,12 @@ def project(fields: AvatarFields, points: Array, condition: Any) -> Array:
     def value(x: Array) -> Array:
         return fields.geometry(x, condition)
 
-    def one(x: Array) -> Array:
-        for _ in range(3):
-            f, g = jax.value_and_grad(value)(x)
-            slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
-            x = x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
-        return x
+    def step(_: int, x: Array) -> Array:
+        f, g = jax.value_and_grad(value)(x)
+        slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
+        return x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
 
-    return jax.vmap(one)(points)
+    return jax.vmap(lambda x: jax.lax.fori_loop(0, 3, step, x))(points)
 
 
 @eqx.filter_jit
