@@ -95,7 +95,10 @@ def config_options() -> set[str]:
 
 
 def script_options(script: Path) -> set[str]:
-    """Option names of a script: fields of its options dataclass, and arguments it adds."""
+    """Option names of a script: fields of its options dataclass, and arguments it adds.
+
+    A benchmark has those, too, of the modules beside it that it imports.
+    """
     if script.name == "fit_grab.py":
         return command_options("fit")
     tree = ast.parse(read(script))
@@ -106,6 +109,9 @@ def script_options(script: Path) -> set[str]:
             options |= {f"--{f.id.replace('_', '-')}" for f in fields if isinstance(f, ast.Name)}
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
             options |= {str(a.value) for a in node.args if isinstance(a, ast.Constant)}
+        if isinstance(node, ast.ImportFrom) and script.parent.name == "benchmarks":
+            beside = script.parent / f"{node.module}.py"
+            options |= script_options(beside) if beside.is_file() else set()
     return options
 
 

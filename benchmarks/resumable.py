@@ -1,0 +1,214 @@
+"""Tables that take hours: each row is written as its run ends, and a second call goes on.
+
+A job is the keyword arguments of one run, `{"name": ..., "seed": ..., more}`; a run gives the
+figures of its row; a row is both together. What is finished is told by the job.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import math
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from statistics import median
+from typing import Any, Protocol, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from search_problems import print_rows
+
+import xavatar_jax as xa
+from xavatar_jax.body import BodyModel, BodyParams
+from xavatar_jax.frames import Frames, posed_vertices
+from xavatar_jax.report import describe_machine, write_json
+
+Job = Mapping[str, Any]
+Row = dict[str, Any]
+
+
+class Posable(Protocol):
+    """What a method gives: a mesh in any pose."""
+
+    def mesh(self, params: BodyParams) -> xa.Mesh: ...
+
+
+Method = Callable[[Frames, float, int], Posable]
+"""`method(frames, minutes, seed)`: learns from frames for so many minutes since the call."""
+
+
+def add_options(
+    parser: argparse.ArgumentParser,
+    names: Iterable[str],
+    *,
+    minutes: float | Sequence[float],
+    seeds: int = 3,
+    eval_frames: int = 12,
+) -> None:
+    """The options that all such tables share; several `minutes` make a list of it."""
+    several = not isinstance(minutes, float | int)
+    parser.add_argument("--quick", action="store_true", help="small: to see that it runs")
+    parser.add_argument("--json", help="keep the table in this file, and go on with one that is")
+    parser.add_argument("--only", nargs="+", choices=list(names), metavar="NAME", help="of "
+                        + ", ".join(names))  # fmt: skip
+    parser.add_argument("--seeds", type=int, default=seeds, help="how many, from 0")
+    parser.add_argument("--minutes", type=float, default=minutes, nargs="+" if several else None,
+                        help="a run, from its call")  # fmt: skip
+    parser.add_argument("--eval-frames", type=int, default=eval_frames, help="held-out frames")
+    parser.add_argument("--cache-dir")
+
+
+def every(**values: Iterable[Any]) -> list[dict[str, Any]]:
+    """A job for each combination; the last entry changes fastest."""
+    return [dict(zip(values, row, strict=True)) for row in product(*values.values())]
+
+
+def fill(
+    jobs: Sequence[Job],
+    run: Callable[..., Mapping[str, Any]],
+    *,
+    question: str,
+    settings: Mapping[str, Any],
+    file: str | Path | None,
+    by: Sequence[str] = ("name",),
+    columns: Sequence[str] = (),
+) -> tuple[dict[str, Any], list[Row]]:
+    """Header and rows of the table: `run(**job)` for each job that the file does not have yet.
+
+    `settings` are what all rows share (minutes, frames): a file with others, or of another
+    machine, is refused. A run that fails is reported, and left for the next call; the others go
+    on. Every run begins with nothing compiled, so that none has the advantage of coming later.
+    At the end the medians are printed: see `print_medians` for `by` and `columns`.
+
+    **Raises:** `ValueError` naming the file and what differs; `SystemExit` at the end if a run
+    failed.
+    """
+    header = {"question": question, **describe_machine(), **settings}
+    rows: list[Row] = []
+    if file is not None and Path(file).exists():
+        rows = _rows_of(Path(file), header, ("device", "cores", "question", *settings))
+    failed = []
+    for k, job in enumerate(jobs):
+        label = ", ".join(str(v) if k == "name" else f"{k} {v}" for k, v in job.items())
+        if any(job.items() <= row.items() for row in rows):
+            print(f"[{k + 1}/{len(jobs)}] {label}: kept", flush=True)
+            continue
+        print(f"[{k + 1}/{len(jobs)}] {label} ...", flush=True)
+        jax.clear_caches()
+        gc.collect()
+        clock = time.perf_counter()
+        try:
+            figures = run(**job)
+        except Exception:
+            traceback.print_exc()
+            failed.append(label)
+            continue
+        spent = time.perf_counter() - clock
+        row = {**job, **figures, "row_s": spent, "commit": header["commit"]}
+        rows.append({name: _plain(value) for name, value in row.items()})
+        header["peak_rss_mb"] = describe_machine()["peak_rss_mb"]
+        if file is not None:
+            write_json(file, {"header": header, "rows": rows})
+    rows = [row for row in rows if any(job.items() <= row.items() for job in jobs)]
+    print(f"{header['device']}, {header['cores']} cores, commit {header['commit']}")
+    print_medians(rows, by, columns)
+    if file is not None:
+        print(f"written: {file}")
+    if failed:
+        sys.exit(f"{len(failed)} of {len(jobs)} runs failed: {'; '.join(failed)}")
+    return header, rows
+
+
+def _rows_of(file: Path, header: Mapping[str, Any], same: Iterable[str]) -> list[Row]:
+    """Rows of a table that was begun, if it is this one."""
+    known = json.loads(file.read_text(encoding="utf-8"))
+    other = [
+        f"{name} {known['header'].get(name)!r} (now {header[name]!r})"
+        for name in same
+        if known["header"].get(name) != json.loads(json.dumps(header[name]))
+    ]
+    if other:
+        raise ValueError(f"{file}: a table with {', '.join(other)}. Use those, or another file")
+    return known["rows"]
+
+
+def medians(rows: Sequence[Row], by: Sequence[str] = ("name",)) -> list[Row]:
+    """A row for each different `by`, in their order: medians over seeds, and how many there are."""
+    groups: dict[tuple, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in by), []).append(row)
+    return [
+        {
+            **dict(zip(by, key, strict=True)),
+            "seeds": len(members),
+            **{name: _median(members, name) for name in _figures(members, by)},
+        }
+        for key, members in groups.items()
+    ]
+
+
+def _figures(rows: Sequence[Row], by: Sequence[str]) -> list[str]:
+    """Names of what are numbers in some row."""
+    names = {name: None for row in rows for name, value in row.items() if _is_number(value)}
+    return [name for name in names if name not in (*by, "seed")]
+
+
+def _median(rows: Sequence[Row], name: str) -> float | None:
+    values = [row[name] for row in rows if _is_number(row.get(name))]
+    return median(values) if values else None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def print_medians(
+    rows: Sequence[Row], by: Sequence[str] = ("name",), columns: Sequence[str] = ()
+) -> None:
+    """The medians as a plain table: `by`, then `columns` (else every figure)."""
+    found = medians(rows, by)
+    if found:
+        print_rows(found, [*by, "seeds", *(columns or _figures(found, (*by, "seeds")))])
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A method's answer with the body that tells hands from face, as `xa.evaluate` asks for."""
+
+    model: Posable
+    body: BodyModel
+    betas: Float[np.ndarray, " S"]
+
+    def mesh(self, params: BodyParams, *, mode: str = "fast") -> xa.Mesh:
+        return self.model.mesh(params)
+
+    def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
+        return posed_vertices(self.body, replace(params, betas=jnp.asarray(self.betas)))
+
+
+def score(
+    model: Posable, body: BodyModel, betas: Any, frames: Frames, count: int
+) -> dict[str, float | None]:
+    """Held-out figures of `xa.evaluate`, named by figure and region: `cd_hands_mm` and so on."""
+    judged = cast(xa.Avatar, _Judged(model, body, np.asarray(betas)))
+    mean = xa.evaluate(judged, frames, num_frames=count, verbose=False).mean.to_json()
+    found = {}
+    for figure in ("cd_mm", "cd_max_mm", "nc", "iou", "iou_box"):
+        stem, unit = (figure[:-3], "_mm") if figure.endswith("_mm") else (figure, "")
+        for region, value in mean[figure].items():
+            found[f"{stem}_{region}{unit}"] = value
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """A JSON value: what is not finite becomes null."""
+    value = value.item() if hasattr(value, "item") else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
