@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_vertices
 from ..geometry import closest_points
@@ -75,6 +76,33 @@ def template_grid_skinning(
     return GridSkinning(
         template=_blend(grids, jnp.asarray(logits, jnp.float32)),
         correction=jnp.zeros((correction_grids.num_nodes, num_logits(body.tree)), jnp.float32),
+        grids=grids,
+        correction_grids=correction_grids,
+        tree=body.tree,
+    )
+
+
+def random_grid_skinning(
+    body: BodyModel,
+    vertices: Float[np.ndarray, "V 3"],
+    spacing: GridSpacing,
+    correction_spacing: GridSpacing,
+    *,
+    key: PRNGKeyArray,
+    scale: float = 0.1,
+) -> GridSkinning:
+    """The same grids, with nothing of the body's weights in them.
+
+    The template's logits are zero; the correction's are normal deviates of `scale`. Only where
+    the nodes lie, finer at hands and face, is told by the body.
+    """
+    grids = body_part_grids(body, vertices, spacing)
+    correction_grids = body_part_grids(body, vertices, correction_spacing)
+    logits = num_logits(body.tree)
+    correction = scale * jax.random.normal(key, (correction_grids.num_nodes, logits), jnp.float32)
+    return GridSkinning(
+        template=jnp.zeros((grids.num_nodes, logits), jnp.float32),
+        correction=_blend(correction_grids, correction),
         grids=grids,
         correction_grids=correction_grids,
         tree=body.tree,

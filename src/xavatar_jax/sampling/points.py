@@ -22,7 +22,8 @@ class SamplingPlan:
     - `sigma`: standard deviations in metres of the normal noise, taken in turn by a
       part's points; `fine_sigma`: the same for hands, face, eyes and mouth.
     - `by_vertex`: draw vertices uniformly, as the released code does; else points by area.
-    - `uniform`: forget the parts and draw from the whole surface (ablation A3).
+    - `uniform`: forget the parts and draw as many points from the whole surface (ablation A3);
+      each keeps the noise of the part that it lies on, and its label.
     - `box_margin`: metres around the frame's bounding box.
     """
 
@@ -93,6 +94,9 @@ def sample_frame(
         drawn, face = _draw(vertices, faces, areas, own, count, plan.by_vertex, rng)
         sigmas = plan.sigma if part == BODY else plan.fine_sigma
         spread = np.resize(np.asarray(sigmas), count)[:, None]
+        if plan.uniform:
+            fine = np.resize(np.asarray(plan.fine_sigma), count)[:, None]
+            spread = np.where((face_labels[face] == BODY)[:, None], spread, fine)
         points.append(drawn + spread * rng.standard_normal((count, 3)))
         parts.append(face_labels[face])
     if plan.box:

@@ -1,5 +1,6 @@
 """Training: configs and presets, the objective, the jitted step, the loop."""
 
+from .ablations import ABLATIONS as ABLATIONS
 from .batch import Batch as Batch
 from .check import TrainingNotice as TrainingNotice
 from .config import PRESETS as PRESETS

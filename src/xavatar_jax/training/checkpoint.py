@@ -25,7 +25,7 @@ from .pool import FramePool
 from .step import TrainState
 from .validation import Best
 
-_FORMAT = 1
+_FORMAT = 2
 # What may change from one part of a run to the next: how long it is, and how large its steps are.
 _FREE = (
     *("steps", "minutes", "report_every", "checkpoint_every", "validation.patience"),
@@ -98,6 +98,11 @@ class Checkpoint:
     @property
     def step(self) -> int:
         return self.header["step"]
+
+    @property
+    def minutes(self) -> float | None:
+        """The budget of the run's last part."""
+        return self.header["run"]["config"]["minutes"]
 
     @property
     def latest(self) -> dict[str, float]:
@@ -185,6 +190,11 @@ def check_header(path: str | os.PathLike[str], header: Mapping[str, Any]) -> Non
     if header.get("kind") != "checkpoint":
         kind = header.get("kind", "something else")
         raise ValueError(f"{os.fspath(path)}: not a checkpoint, but {kind}")
+    if header["format"] < _FORMAT:
+        raise ValueError(
+            f"{os.fspath(path)}: a checkpoint of an older version (format {header['format']}, now "
+            f"{_FORMAT}); begin the run anew"
+        )
     refuse_newer(path, header, _FORMAT, written_by=header["versions"]["xavatar_jax"])
 
 

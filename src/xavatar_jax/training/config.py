@@ -13,9 +13,15 @@ from ..sampling import SamplingPlan
 
 @dataclass(frozen=True)
 class SkinningConfig:
-    """`grid`: template weights on part grids with a learned correction; `mlp`: the paper's."""
+    """`grid`: template weights on part grids with a learned correction; `mlp`: the paper's.
+
+    `start`: from the template's weights, or at random. At random a network is as it was drawn,
+    and grids have no template beneath the correction, whose spacing is then that of the field;
+    roots have to be searched in the step (`SearchConfig.cached=False`).
+    """
 
     kind: Literal["grid", "mlp"] = "grid"
+    start: Literal["template", "random"] = "template"
     grid: GridSpacing = GridSpacing(face=0.0054)
     correction: GridSpacing = GridSpacing(body=0.048, hands=0.012, face=0.024)
     mlp: MLPShape = PAPER_SKINNING
@@ -118,9 +124,12 @@ class ValidationConfig:
 class FitConfig:
     """Everything that decides a run.
 
-    - `steps`, `minutes`: whichever ends first; `minutes` counts from the call of `fit`.
+    - `steps`, `minutes`: whichever ends first; `minutes` counts from the call of `fit`. A
+      schedule that falls ends when the minutes do, by the number of steps that they were found
+      to hold.
     - `train_frames`: frames drawn for their variety (0: all). Memory grows with their number, and
       not with that of the frames they are drawn from.
+    - `frames_per_minute`: with `minutes`, no more frames than so many for each (0: no limit).
     - `points`: how many points a frame gives, and where.
     - `frames_per_step`, `points_per_step` (of each frame).
     - `skinning_every`, `skinning_points`: with stored roots, every so many steps the skinning
@@ -136,6 +145,7 @@ class FitConfig:
     steps: int = 1500
     minutes: float | None = None
     train_frames: int = 200
+    frames_per_minute: int = 25
     frames_per_step: int = 16
     points_per_step: int = 512
     skinning_every: int = 4
@@ -197,6 +207,15 @@ def paper() -> FitConfig:
 
 PRESETS = {"quick": quick, "paper": paper}
 """Presets by name: functions that give a `FitConfig`."""
+
+
+def check_start(config: FitConfig) -> None:
+    """**Raises:** `ValueError` for stored roots of a skinning field that starts at random."""
+    if config.skinning.start == "random" and config.search.cached:
+        raise ValueError(
+            "skinning.start='random' with search.cached=True: roots are stored once, and those of "
+            "a random field lead nowhere; set search.cached=False, so that each step searches"
+        )
 
 
 def config_to_dict(config: FitConfig) -> dict[str, Any]:

@@ -94,6 +94,14 @@ class Devices:
 
         return bool(np.any(process_allgather(np.asarray(flag))))
 
+    def least(self, number: int) -> int:
+        """The least of the numbers of all processes; every process has to ask."""
+        if jax.process_count() == 1:
+            return number
+        from jax.experimental.multihost_utils import process_allgather
+
+        return int(np.min(process_allgather(np.asarray(number))))
+
     @property
     def count(self) -> int:
         return 1 if self.mesh is None else self.mesh.size

@@ -17,6 +17,8 @@ class History:
     - `seconds`: by stage, over all calls where a run was resumed.
     - `steps_done`; `best_step`: the step whose fields are kept; `stopped`: "steps", "minutes",
       "plateau", "interrupt" or "not finite".
+    - `frames`: how many were learned from; `planned`: steps that the minutes were found to hold,
+      where the schedule falls (0: not planned).
     - `found`: share of points with a root, where roots are stored.
     """
 
@@ -28,6 +30,8 @@ class History:
     steps_done: int = 0
     best_step: int = 0
     stopped: str = ""
+    frames: int = 0
+    planned: int = 0
     found: float = float("nan")
 
     def lap(self, stage: str, since: float) -> float:

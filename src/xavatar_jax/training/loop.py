@@ -16,9 +16,10 @@ from jaxtyping import Int
 from ..body import BodyModel, check_params
 from ..frames import Frames
 from ..sampling import varied_frames
+from .budget import as_begun, frames_in_budget, say_fewer_frames
 from .check import TrainingNotice
 from .checkpoint import Keeper, load_checkpoint, run_identity
-from .config import FitConfig
+from .config import FitConfig, check_start
 from .devices import ONE_DEVICE, Devices, share_work
 from .history import History
 from .log import JsonLines
@@ -53,15 +54,18 @@ def fit_fields(
     JSON object a line; `devices`: those that share a step (default: all); `fields`: to begin with,
     in place of those of the config; `terms`: more terms of the loss.
 
-    **Raises:** `ValueError` for frames that do not fit the body, or a checkpoint of another run;
-    `TrainingError` naming the term that is not finite; `Interrupted` after Ctrl-C.
+    **Raises:** `ValueError` for frames that do not fit the body, a checkpoint of another run, or
+    stored roots of a field that starts at random; `TrainingError` naming the term that is not
+    finite; `Interrupted` after Ctrl-C.
     """
     started = time.perf_counter()
+    check_start(config)
     deadline = None if config.minutes is None else started + 60 * config.minutes
     check_params(body, frames.params, what="frames.params")
     check_terms(terms or {})
     sharing = share_work(config, devices)
-    learned, held = choose_frames(frames, config)
+    begun = as_begun(config, checkpoint) if resume and checkpoint is not None else config
+    learned, held = choose_frames(frames, begun)
     chosen = frames[np.concatenate([learned, held])]
     keeper = None
     if checkpoint is not None:
@@ -70,7 +74,7 @@ def fit_fields(
         keeper = Keeper(Path(checkpoint), identity, saved)
     elif resume:
         raise ValueError("resume=True needs checkpoint=FILE, the file to go on from")
-    history = History()
+    history = History(frames=len(learned))
     if keeper is not None and keeper.saved is not None:
         history = keeper.saved.history()
     lines = None
@@ -126,9 +130,12 @@ def choose_frames(
     """Indices of the frames to learn from, chosen for their variety, and of those to be judged by.
 
     The latter are of the end of each sequence, and none of the former is.
+
+    **Warns:** `TrainingNotice` if `minutes` leave out frames that were asked for.
     """
     rows, held = split_validation(frames, config.validation)
-    count = config.train_frames or len(rows)
+    count = min(frames_in_budget(config) or len(rows), len(rows))
+    say_fewer_frames(config, count, min(config.train_frames or len(rows), len(rows)))
     return rows[varied_frames(frames.params[rows], count)], held
 
 

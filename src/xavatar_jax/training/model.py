@@ -20,6 +20,7 @@ from ..fields import (
     MLPGeometry,
     MLPSkinning,
     mean_canonical_vertices,
+    random_grid_skinning,
     template_grid_skinning,
 )
 from .config import FitConfig, GeometryConfig, SkinningConfig
@@ -38,19 +39,26 @@ class AvatarFields(eqx.Module):
 
 def fresh_fields(body: BodyModel, config: FitConfig) -> AvatarFields:
     """Fields before anything was fitted: a function of body, config and seed."""
-    key_skinning, key_geometry = jax.random.split(jax.random.key(config.seed))
-    return AvatarFields(
-        skinning=_skinning(body, config.skinning, key_skinning),
-        geometry=_geometry(body, config.geometry, key_geometry),
-    )
+    key_skinning, key_geometry = _keys(config)
+    if config.skinning.kind == "mlp":
+        skinning = MLPSkinning(body.tree, config.skinning.mlp, key=key_skinning)
+    else:
+        skinning = _grids(body, mean_canonical_vertices(body), config.skinning, key_skinning)
+    return AvatarFields(skinning, _geometry(body, config.geometry, key_geometry))
 
 
-def _skinning(body: BodyModel, config: SkinningConfig, key: Array) -> AbstractSkinningField:
-    if config.kind == "mlp":
-        return MLPSkinning(body.tree, config.mlp, key=key)
-    return template_grid_skinning(
-        body, mean_canonical_vertices(body), config.grid, config.correction
-    )
+def _keys(config: FitConfig) -> Array:
+    """Keys of the skinning and of the geometry."""
+    return jax.random.split(jax.random.key(config.seed))
+
+
+def _grids(
+    body: BodyModel, vertices: Float[np.ndarray, "V 3"], config: SkinningConfig, key: Array
+) -> GridSkinning:
+    """A grid field around canonical vertices."""
+    if config.start == "random":
+        return random_grid_skinning(body, vertices, config.grid, config.correction, key=key)
+    return template_grid_skinning(body, vertices, config.grid, config.correction)
 
 
 def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGeometryField:
@@ -104,14 +112,15 @@ def settle_on_person(
     The surface term of the objective asks for the template's weights at the person's canonical
     vertices (X-Avatar, section 3.4, which takes the subject's mean shape there). On grids that
     has a direct solution, which gradient descent from the mean shape would take long to find
-    where a hand lies some centimetres away. Networks come back as they are.
+    where a hand lies some centimetres away. Networks come back as they are, and so do template
+    weights where that term is off (ablation A4). Grids that start at random are only moved to the
+    person, and know no weights of the template.
     """
     shape = jnp.asarray(betas, body.template.dtype)
-    if isinstance(fields.skinning, GridSkinning):
+    asked = config.losses.surface > 0 or config.skinning.start == "random"
+    if isinstance(fields.skinning, GridSkinning) and asked:
         vertices = np.asarray(canonical_vertices(body, shape), np.float64)
-        grid = template_grid_skinning(
-            body, vertices, config.skinning.grid, config.skinning.correction
-        )
+        grid = _grids(body, vertices, config.skinning, _keys(config)[0])
         fields = eqx.tree_at(lambda f: f.skinning, fields, grid)
     if isinstance(fields.geometry, HashGeometry):
         joints = jnp.asarray(canonical_joints(body, shape), jnp.float32)

@@ -127,7 +127,7 @@ def full_objective(
     """All terms, with roots searched on the fields themselves (X-Avatar, eq. 9 to 12)."""
     conditions = jax.vmap(fields.geometry.condition)(batch.params)
     roots, valid = devices.apart(
-        lambda fields, batch: _search(fields, batch, config, anchors.tree), fields, batch
+        lambda fields, batch: search_batch(fields, batch, config, anchors.tree), fields, batch
     )
     chosen, found = jax.vmap(_best_root, in_axes=(None, 0, 0, 0))(fields, roots, valid, conditions)
     logit, regular = _logit_through_root(fields, chosen, batch, conditions)
@@ -237,7 +237,7 @@ def _best_stored(
     return jnp.concatenate([best, root[rows:]])
 
 
-def _search(
+def search_batch(
     fields: AvatarFields, batch: Batch, config: FitConfig, tree: KinematicTree
 ) -> tuple[Float[Array, "B M K 3"], Bool[Array, "B M K"]]:
     """Roots of every point, searched on the field itself, inside the training step."""

@@ -124,12 +124,17 @@ def _step(
 
 
 def _prefit_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
-    """Geometry always; skinning where it is a network (a grid already holds the template)."""
+    """Geometry always; skinning where it is a network (a grid already holds the template), and
+    where it does not start at random."""
     learned = trainable_filter(fields, config)
-    if config.skinning.kind == "grid":
+    if not _fits_skinning(config):
         frozen = jax.tree.map(lambda _: False, fields.skinning)
         learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
     return learned
+
+
+def _fits_skinning(config: FitConfig) -> bool:
+    return config.skinning.kind != "grid" and config.skinning.start == "template"
 
 
 def _mean_shape_points(body: BodyModel, config: FitConfig) -> tuple[Array, Array, Array | None]:
@@ -150,6 +155,6 @@ def _mean_shape_points(body: BodyModel, config: FitConfig) -> tuple[Array, Array
     points = np.concatenate([points, far])
     distance = signed_distance(vertices, faces, points)
     weights = None
-    if config.skinning.kind != "grid":
+    if _fits_skinning(config):
         weights = jnp.asarray(template_weights(body, vertices, points), jnp.float32)
     return jnp.asarray(points, jnp.float32), jnp.asarray(distance, jnp.float32), weights

@@ -16,6 +16,7 @@ from jaxtyping import Int
 
 from .._version import __version__
 from ..body import BodyModel
+from .budget import Pace
 from .checkpoint import Keeper
 from .config import FitConfig, config_to_dict
 from .devices import Devices
@@ -89,12 +90,21 @@ class Run:
         self.best = Best()
         self.latest: dict[str, Any] = {}
         self.at = 0
+        self.validation_s = 0.0
         saved = None if keeper is None else keeper.saved
         if saved is not None:
             self.best = saved.best(state.learned)
             self.latest.update(saved.latest)
             state, self.at = saved.state(state), saved.step
+            # More steps, or other minutes, are another plan.
+            if self.config.minutes is None or self.config.minutes != saved.minutes:
+                history.planned = 0
             self.best = replace(self.best, learned=devices.replicate(self.best.learned))
+        self.total = min(history.planned or self.config.steps, self.config.steps)
+        state = eqx.tree_at(lambda s: s.total, state, jnp.asarray(self.total, jnp.int32))
+        self.pace = None
+        if deadline is not None and not history.planned and config.optimiser.schedule == "cosine":
+            self.pace = Pace(config.skinning_every if "skinning" in self.steps else 1, deadline)
         self.state, self.pool = devices.replicate(state), devices.replicate(pool)
         self.began, self.trained = self.at, history.seconds.get("train", 0.0)
         self.compiled: set[str] = set()
@@ -104,8 +114,7 @@ class Run:
     def to_the_end(self, *, verbose: bool) -> Fitted:
         """Steps until there are enough, time is up, nothing is gained, or somebody stops it."""
         show = verbose and self.first
-        total = self.config.steps
-        with progress("training", total, verbose=show, unit="step") as bar:
+        with progress("training", self.total, verbose=show, unit="step") as bar:
             bar.update(self.at)
             with stop_between_steps() as flag:
                 reason = self._reason(flag)
@@ -148,6 +157,8 @@ class Run:
     def _between(self, flag: StopFlag, bar: Any) -> str:
         """What is due after a step; why to stop, if so."""
         config, k = self.config, self.at
+        if self.pace is not None:
+            self._plan(self.pace, bar)
         polished = "skinning" in self.steps and k % config.polish_every == 0
         validated = self.validation is not None and k % config.validation.every == 0
         reported = k % self.config.report_every == 0
@@ -171,9 +182,9 @@ class Run:
 
     def _reason(self, flag: StopFlag) -> str:
         """Why to stop now, or nothing."""
-        if self.at >= self.config.steps:
-            return "steps"
-        if self.best.plateau(self.at, self.config):
+        if self.at >= self.total:
+            return "steps" if self.total >= self.config.steps else "minutes"
+        if self.best.plateau(self.at, self.config, self.total):
             return "plateau"
         # Hosts have clocks and signals of their own: they ask each other, and not at every step.
         if jax.process_count() > 1 and self.at % self.config.report_every:
@@ -186,6 +197,40 @@ class Run:
             return "interrupt"
         return "minutes" if self.devices.agree(late) else ""
 
+    def _plan(self, pace: Pace, bar: Any) -> None:
+        """Once enough steps were timed: let the schedule end when time does.
+
+        The number is kept, in state, history and checkpoint: a run that goes on has it, too.
+        """
+        if pace.since is None:
+            if len(self.compiled) == len(self.steps) and self.at % pace.cycle == 0:
+                self._settle()
+                self._book("train")
+                if self.validation is not None:
+                    self._ask()  # compiles it
+                    clock = time.perf_counter()
+                    self._ask()
+                    self.validation_s = time.perf_counter() - clock
+                self._book("compile")
+                pace.start()
+            return
+        if not pace.enough():
+            return
+        self._settle()
+        extra = self.validation_s / self.config.validation.every
+        most = self.at + self.devices.least(pace.steps_left(extra))
+        self.total = self.history.planned = min(most, self.config.steps)
+        total = self.devices.replicate(jnp.asarray(self.total, jnp.int32))
+        self.state = eqx.tree_at(lambda s: s.total, self.state, total)
+        self.pace = None
+        bar.total = self.total
+        self._write({"event": "plan", "step": self.at, "steps": self.total})
+
+    def _ask(self) -> float:
+        """The loss on the validation frames."""
+        assert self.validation is not None
+        return float(self.validation(eqx.combine(self.state.learned, self.base), self.pool))
+
     def _polish(self) -> None:
         """Let stored roots follow the skinning field; on one device, for it is little work."""
         skinning = self.devices.collect(with_learned(self.base, self.state).skinning)
@@ -194,10 +239,8 @@ class Run:
         self.pool = self.devices.replicate(pool)
 
     def _validate(self) -> None:
-        assert self.validation is not None
         self._book("train")
-        fields = eqx.combine(self.state.learned, self.base)
-        loss = float(self.validation(fields, self.pool))
+        loss = self._ask()
         if not math.isfinite(loss):
             self._fail(self.at, "validation", loss)
         self.best.update(self.at, loss, self.state.learned, self.config.validation)
@@ -289,7 +332,7 @@ class Run:
                 "from there"
             )
         raise Interrupted(
-            f"stopped at step {self.at} of {self.config.steps}: {kept}.",
+            f"stopped at step {self.at} of {self.total}: {kept}.",
             step=self.at,
             signal=flag.number,
             fitted=self.fitted(),
@@ -308,5 +351,6 @@ class Run:
             "version": __version__,
             "jax": jax.__version__,
             "devices": self.devices.count,
+            "frames": len(self.learned_from),
             "config": config_to_dict(self.config),
         }

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .batch import Batch
 from .config import FitConfig
@@ -30,25 +30,37 @@ from .pool import FramePool
 
 
 class TrainState(eqx.Module):
-    """What a step changes: learned leaves, an optimiser state for each field, steps done."""
+    """What a step changes: learned leaves, an optimiser state for each field, steps done.
+
+    `total`: the step at which a falling rate is at its end.
+    """
 
     learned: AvatarFields
     optimisers: dict[str, Any]
     step: Int[Array, ""]
+    total: Int[Array, ""]
 
 
 Step = Callable[[TrainState, FramePool], tuple[TrainState, dict[str, Array]]]
 
 
-def make_optimiser(config: FitConfig, rate: float, steps: int) -> optax.GradientTransformation:
-    """Adam after a global-norm clip."""
+def make_optimiser(config: FitConfig) -> optax.GradientTransformation:
+    """Adam after a global-norm clip, at a rate of one: see `falling` for the rate."""
     options = config.optimiser
-    schedule: Any = rate
-    if options.schedule == "cosine":
-        schedule = optax.cosine_decay_schedule(rate, max(steps, 1), alpha=0.01)
     return optax.chain(
-        optax.clip_by_global_norm(options.clip), optax.adam(schedule, eps=options.epsilon)
+        optax.clip_by_global_norm(options.clip), optax.scale_by_adam(eps=options.epsilon)
     )
+
+
+def falling(config: FitConfig, step: Int[Array, ""], total: Int[Array, ""]) -> Float[Array, ""]:
+    """What is left of the learning rates at a step, from one to a hundredth at the last.
+
+    `total` may be told while a run goes on: it is no constant of the compiled step.
+    """
+    if config.optimiser.schedule == "constant":
+        return jnp.ones(())
+    share = jnp.minimum(step / jnp.maximum(total, 1).astype(jnp.float32), 1)
+    return 0.01 + 0.99 * 0.5 * (1 + jnp.cos(jnp.pi * share))
 
 
 def draw_batch(
@@ -147,42 +159,34 @@ def make_steps(
         )
 
     for plan in _plans(pool, config, held):
-        optimisers[plan.name] = plan.optimiser(config).init(_own(learned, plan.name))
+        optimisers[plan.name] = make_optimiser(config).init(_own(learned, plan.name))
         steps[plan.name] = bind(plan)
-    return TrainState(learned, optimisers, jnp.zeros((), jnp.int32)), steps
+    at, total = jnp.zeros((), jnp.int32), jnp.asarray(config.steps, jnp.int32)
+    return TrainState(learned, optimisers, at, total), steps
 
 
 @dataclass(frozen=True)
 class _Plan:
     """What a kind of step learns, and what it draws. Values alone, so that equal ones share code.
 
-    `points` a frame, `several` of them from those with many roots, none of the last `held` frames;
-    a learning `rate`, which falls over `total` steps of this kind.
+    `points` a frame, `several` of them from those with many roots, none of the last `held` frames.
     """
 
     name: str
     points: int
     several: int
     held: int
-    rate: float
-    total: int
-
-    def optimiser(self, config: FitConfig) -> optax.GradientTransformation:
-        return make_optimiser(config, self.rate, self.total)
 
 
 def _plans(pool: FramePool, config: FitConfig, held: int) -> list[_Plan]:
-    rates, points = config.optimiser, config.points_per_step
+    points = config.points_per_step
     if not config.search.cached:
-        return [_Plan("both", points, 0, held, rates.learning_rate, config.steps)]
+        return [_Plan("both", points, 0, held)]
     several = rows_with_several(pool, points)
-    plans = [_Plan("geometry", points, several, held, rates.learning_rate, config.steps)]
+    plans = [_Plan("geometry", points, several, held)]
     if config.skinning.learned:
         count = min(config.skinning_points, points)
-        total = config.steps // config.skinning_every
-        plans.append(
-            _Plan("skinning", count, min(several, count), held, rates.skinning_rate, total)
-        )
+        plans.append(_Plan("skinning", count, min(several, count), held))
     return plans
 
 
@@ -195,6 +199,22 @@ def _with_own(learned: AvatarFields, name: str, own: Any) -> AvatarFields:
     if name == "both":
         return own
     return eqx.tree_at(lambda f: getattr(f, name), learned, own)
+
+
+def _at_rates(updates: Any, name: str, config: FitConfig, left: Array) -> Any:
+    """Steps of length one against the gradient, times a rate for each field."""
+    rates = {
+        "geometry": config.optimiser.learning_rate, "skinning": config.optimiser.skinning_rate
+    }  # fmt: skip
+
+    def scaled(tree: Any, rate: float) -> Any:
+        return jax.tree.map(lambda leaf: -rate * left * leaf, tree)
+
+    if name != "both":
+        return scaled(updates, rates[name])
+    # One clip over all, as the paper has it, but a rate for each field.
+    own = (scaled(updates.skinning, rates["skinning"]), scaled(updates.geometry, rates["geometry"]))
+    return eqx.tree_at(lambda u: (u.skinning, u.geometry), updates, own)
 
 
 # Made once: a second run of the same shapes and options does not compile again.
@@ -228,16 +248,11 @@ def _step(
 
     own = _own(state.learned, name)
     (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
-    updates, optimiser_state = plan.optimiser(config).update(gradient, state.optimisers[name], own)
-    if name == "both":
-        # One clip over all, as the paper has it, but a rate for each field.
-        share = config.optimiser.skinning_rate / config.optimiser.learning_rate
-        updates = eqx.tree_at(
-            lambda u: u.skinning, updates, jax.tree.map(lambda leaf: share * leaf, updates.skinning)
-        )
+    updates, optimiser_state = make_optimiser(config).update(gradient, state.optimisers[name], own)
+    updates = _at_rates(updates, name, config, falling(config, state.step, state.total))
     learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
     optimisers = {**state.optimisers, name: optimiser_state}
-    after = TrainState(learned, optimisers, state.step + 1)
+    after = TrainState(learned, optimisers, state.step + 1, state.total)
     size = optax.tree.norm(gradient)
     good = jnp.isfinite(total) & jnp.isfinite(size)
     after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)

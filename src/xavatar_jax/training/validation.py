@@ -96,8 +96,8 @@ class Best:
         if not np.isfinite(self.mark) or loss < self.mark * (1 - config.gain):
             self.mark, self.gained = loss, step
 
-    def plateau(self, step: int, config: FitConfig) -> bool:
-        """Whether there was no gain for so long that training can stop.
+    def plateau(self, step: int, config: FitConfig, total: int | None = None) -> bool:
+        """Whether there was no gain for so long that training, of `total` steps, can stop.
 
         A loss that stands still under a high rate often falls again as the rate does: with a
         falling rate, only the second half of the steps counts.
@@ -107,7 +107,7 @@ class Best:
             return False
         since = self.gained
         if config.optimiser.schedule == "cosine":
-            since = max(since, config.steps // 2)
+            since = max(since, (config.steps if total is None else total) // 2)
         return step - since >= patience
 
     def to_dict(self) -> dict[str, float]:
