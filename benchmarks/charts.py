@@ -12,6 +12,11 @@ from xavatar_jax.render.sheet import draw_text
 _COLORS = ((31, 119, 180), (214, 96, 32), (44, 140, 60), (120, 80, 170), (110, 110, 110))
 
 
+def tick(value: float) -> str:
+    """A number at an axis: whole ones with their thousands apart, others as they are."""
+    return f"{value:,.0f}" if value >= 1 and value == int(value) else f"{value:g}"
+
+
 def log_chart(
     lines: Mapping[str, Sequence[tuple[float, float]]],
     *,
@@ -51,9 +56,9 @@ def log_chart(
     for k, name in enumerate(list(lines)[: len(_COLORS)]):
         picture = draw_text(picture, name, (left + 32, top + 2 + 20 * k), 13)
     for y in powers:
-        picture = draw_text(picture, f"{y:,.0f}", (8, int(place(10 ** low[0], y)[1]) - 8), 13)
+        picture = draw_text(picture, tick(y), (8, int(place(10 ** low[0], y)[1]) - 8), 13)
     for x in x_ticks:
         at = (int(place(x, 10 ** low[1])[0]), height - bottom + 8)
-        picture = draw_text(picture, f"{x:,.0f}", at, 13, centred=True)
+        picture = draw_text(picture, tick(x), at, 13, centred=True)
     picture = draw_text(picture, x_label, ((left + width) // 2, height - 26), 14, centred=True)
     return draw_text(picture, title, (8, 10), 15)

@@ -1,0 +1,184 @@
+"""What each part of the method is worth: the paper's ablations at equal time.
+
+Question: how far does the held-out accuracy fall, of hands above all, if every search starts at
+the body's bones (A1) or at all bones (A2), if points are drawn without regard to parts (A3), or
+if nothing holds the weights at the surface (A4)? And if the template's weights are kept as they
+are?
+
+Every row is a run of `xa.fit` of so many minutes from its call, on the bundled capture. Settings:
+
+- `quick`: the preset, with roots that are found once and polished.
+- `quick-random`: its fields, but weights that start at random, without a template; roots are
+  searched in every step.
+- `mlp`, `mlp-random`: the paper's skinning network, fitted to the template first or as drawn;
+  roots are searched in every step.
+
+    python benchmarks/table1_ablations.py --json table1.json [--settings NAME...] [--only NAME...]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from resumable import Row, add_options, every, fill, medians, score
+from search_problems import least_time
+
+import xavatar_jax as xa
+from xavatar_jax.fields import GridSpacing
+from xavatar_jax.training import ABLATIONS, FitConfig, initial_fields
+from xavatar_jax.training.objective import search_batch
+from xavatar_jax.training.pool import label_frames
+from xavatar_jax.training.progress import progress
+from xavatar_jax.training.step import draw_batch
+
+NAMES = ("complete", *ABLATIONS, "fixed")
+SETTINGS = ("quick", "quick-random", "mlp", "mlp-random")
+COLUMNS = (
+    *("cd_all_mm", "cd_hands_mm", "cd_face_mm", "steps", "step_ms", "search_share", "fit_s"),
+    "frames",
+)
+
+
+def setting_config(setting: str, minutes: float) -> FitConfig:
+    """The complete method in a setting."""
+    config = replace(xa.quick(), minutes=minutes, steps=20_000)
+    if setting == "quick":
+        return config
+    config = replace(
+        config,
+        frames_per_step=2,
+        points_per_step=1000,
+        search=replace(config.search, cached=False),
+        validation=replace(config.validation, every=100),
+    )
+    skinning = config.skinning
+    if setting.startswith("mlp"):
+        skinning = replace(skinning, kind="mlp")
+        config = replace(config, optimiser=replace(config.optimiser, skinning_rate=1e-3))
+    if setting.endswith("random"):
+        # Without a template the learned grid is the field, and needs its nodes.
+        finer = GridSpacing(body=0.024, hands=0.008, face=0.012)
+        return replace(config, skinning=replace(skinning, start="random", correction=finer))
+    if setting == "mlp":
+        config = replace(
+            config,
+            prefit_steps=4000,
+            optimiser=replace(config.optimiser, skinning_rate=1e-4),
+        )
+    return replace(config, skinning=skinning)
+
+
+def small(config: FitConfig) -> FitConfig:
+    """The same in a minute or so, to see that it runs."""
+    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=20)
+
+
+def change(config: FitConfig, name: str) -> FitConfig:
+    """The config with one thing changed."""
+    if name == "fixed":
+        return replace(config, skinning=replace(config.skinning, learned=False))
+    return ABLATIONS[name](config) if name in ABLATIONS else config
+
+
+def search_seconds(result: Any, capture: Any, config: FitConfig) -> float:
+    """Seconds that the search of one step takes, on the fields that were learned."""
+    avatar = result.avatar
+    frames = result.frames[: config.frames_per_step]
+    with progress("points", len(frames), verbose=False) as bar:
+        pool = label_frames(capture.body, frames, config, bar=bar)
+    config = replace(config, points_per_step=min(config.points_per_step, pool.points.shape[1]))
+    batch = draw_batch(pool, config, config.points_per_step, 0, jax.random.key(config.seed))
+    search = eqx.filter_jit(lambda f, b: search_batch(f, b, config, capture.body.tree))
+    least_time(lambda: search(avatar.fields, batch), 1)
+    return least_time(lambda: search(avatar.fields, batch), 3)[1]
+
+
+def measure(
+    name: str, setting: str, seed: int, *, capture: Any, args: argparse.Namespace
+) -> dict[str, Any]:
+    """Figures of one run."""
+    config = setting_config(setting, args.minutes)
+    config = change(small(config) if args.quick else config, name)
+    config = replace(config, seed=seed)
+    # The first fields are the same for all, and are not what is compared: they are made before.
+    initial_fields(capture.body, config, cache=args.cache_dir)
+    result = xa.fit(capture.train, config, cache=args.cache_dir, verbose=False)
+    history, avatar = result.history, result.avatar
+    seconds = history.seconds
+    step_s = seconds["train"] / max(history.steps_done - 1, 1)
+    if config.search.cached:
+        share = seconds["roots"] / (seconds["roots"] + seconds["train"])
+    else:
+        share = search_seconds(result, capture, config) / step_s
+    return {
+        **score(avatar, capture.body, jnp.asarray(avatar.betas), capture.test, args.eval_frames),
+        "steps": history.steps_done,
+        "best_step": history.best_step,
+        "frames": history.frames,
+        "step_ms": 1000 * step_s,
+        "search_share": share,
+        "fit_s": seconds["total"],
+        "labels_s": seconds["labels"],
+        "roots_s": seconds.get("roots"),
+        "compile_s": seconds["compile"],
+        "stopped": history.stopped,
+    }
+
+
+def compare(rows: Sequence[Row]) -> list[str]:
+    """A sentence on each ablation beside the complete method, by setting; medians over seeds."""
+    said = []
+    found = medians(rows, ("setting", "name"))
+    for setting in SETTINGS:
+        own = {row["name"]: row for row in found if row["setting"] == setting}
+        whole = own.pop("complete", None)
+        for name, row in own.items() if whole else ():
+            words = [f"{setting}, {name} beside complete:"]
+            for region in ("all", "hands", "face"):
+                key = f"cd_{region}_mm"
+                if whole.get(key) and row.get(key):
+                    words.append(f"{region} {100 * (row[key] / whole[key] - 1):+.0f} %,")
+            words.append(f"step time x {row['step_ms'] / whole['step_ms']:.2f}")
+            said.append(" ".join(words))
+    return said
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The paper's ablations at equal time.")
+    add_options(parser, NAMES, minutes=3)
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, metavar="NAME", help="of "
+                        + ", ".join(SETTINGS))  # fmt: skip
+    args = parser.parse_args()
+    if args.quick:
+        args.eval_frames, args.seeds = 1, 1
+    names = args.only or (("complete", "A3") if args.quick else NAMES)
+    settings = args.settings or (("quick",) if args.quick else SETTINGS)
+    capture = xa.synthetic_capture(args.cache_dir)
+    jobs = every(seed=range(args.seeds), setting=settings, name=names)
+    # Weights that started at random have nothing to be kept at.
+    jobs = [j for j in jobs if j["name"] != "fixed" or not j["setting"].endswith("random")]
+    _, rows = fill(
+        jobs,
+        lambda **job: measure(**job, capture=capture, args=args),
+        question="the paper's ablations at equal time",
+        settings={
+            "quick": args.quick,
+            "minutes": args.minutes,
+            "eval_frames": args.eval_frames,
+            "data": capture.name,
+        },
+        file=args.json,
+        by=("setting", "name"),
+        columns=COLUMNS,
+    )
+    print("\n".join(compare(rows)))
+
+
+if __name__ == "__main__":
+    main()
