@@ -138,7 +138,9 @@ def compare(rows: Sequence[Row]) -> list[str]:
     for setting in SETTINGS:
         own = {row["name"]: row for row in found if row["setting"] == setting}
         whole = own.pop("complete", None)
-        for name, row in own.items() if whole else ():
+        if whole is None:
+            continue
+        for name, row in own.items():
             words = [f"{setting}, {name} beside complete:"]
             for region in ("all", "hands", "face"):
                 key = f"cd_{region}_mm"
