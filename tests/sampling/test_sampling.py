@@ -143,6 +143,21 @@ def test_counts_by_part_and_places(frame, by_vertex):
     assert np.ptp(box, axis=0).min() > 0.5 * (high - low).min()
 
 
+def test_every_vertex_of_a_part_has_the_same_odds(frame):
+    plan = replace(PLAN, body=0, face=0, eyes_mouth=0, hand=16_200, box=0)
+    found = sample_frame(*frame, plan, np.random.default_rng(3))
+    toy, labels = frame
+    for part in (2, 3):
+        own = toy.vertices[labels == part]
+        drawn = found.points[found.parts == part]
+        apart = np.abs(drawn[:, None] - own).max(2)
+        assert apart.min(1).max() < 1e-6
+        times = np.bincount(apart.argmin(1), minlength=len(own))
+        assert len(own) == 162
+        # A hundred draws a vertex: five standard deviations of such a count.
+        assert np.abs(times - 100).max() < 50
+
+
 def test_noise_has_the_sizes_given(frame):
     plan = SamplingPlan(
         body=4000, face=0, eyes_mouth=0, hand=0, sigma=(0.002, 0.03), by_vertex=False

@@ -78,8 +78,10 @@ def sample_frame(
     """
     vertices, faces = np.asarray(frame.vertices, np.float64), np.asarray(frame.faces)
     # A triangle belongs to the part of its first vertex: borders are a triangle wide.
-    face_labels = labels[faces[:, 0]]
-    areas = face_areas(vertices, faces)
+    place_labels, areas = labels[faces[:, 0]], face_areas(vertices, faces)
+    surface = np.unique(faces)  # its vertices: others may lie anywhere
+    if plan.by_vertex:
+        place_labels = labels[surface]
     points, parts = [], []
     counts = plan.counts()
     if plan.uniform:
@@ -87,18 +89,23 @@ def sample_frame(
     for part, count in counts.items():
         if not count:
             continue
-        own = np.flatnonzero(face_labels == part) if not plan.uniform else np.arange(len(faces))
+        every = np.arange(len(place_labels))
+        own = every if plan.uniform else np.flatnonzero(place_labels == part)
         if not len(own):
-            own = np.flatnonzero(face_labels == BODY)
-            own = own if len(own) else np.arange(len(faces))
-        drawn, face = _draw(vertices, faces, areas, own, count, plan.by_vertex, rng)
+            own = np.flatnonzero(place_labels == BODY)
+            own = own if len(own) else every
+        if plan.by_vertex:
+            place = own[rng.integers(0, len(own), count)]
+            drawn = vertices[surface[place]]
+        else:
+            drawn, place = _on_triangles(vertices, faces, areas, own, count, rng)
         sigmas = plan.sigma if part == BODY else plan.fine_sigma
         spread = np.resize(np.asarray(sigmas), count)[:, None]
         if plan.uniform:
             fine = np.resize(np.asarray(plan.fine_sigma), count)[:, None]
             spread = np.where((face_labels[face] == BODY)[:, None], spread, fine)
         points.append(drawn + spread * rng.standard_normal((count, 3)))
-        parts.append(face_labels[face])
+        parts.append(place_labels[place])
     if plan.box:
         low, high = vertices.min(0) - plan.box_margin, vertices.max(0) + plan.box_margin
         points.append(rng.uniform(low, high, (plan.box, 3)))
@@ -112,20 +119,15 @@ def sample_frame(
     )
 
 
-def _draw(
+def _on_triangles(
     vertices: np.ndarray,
     faces: np.ndarray,
     areas: np.ndarray,
     own: np.ndarray,
     count: int,
-    by_vertex: bool,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the chosen triangles, and the triangle of each."""
-    if by_vertex:
-        corner, first = np.unique(faces[own, 0], return_index=True)
-        pick = rng.integers(0, len(corner), count)
-        return vertices[corner[pick]], own[first[pick]]
+    """Points uniform by area on the chosen triangles, and the triangle of each."""
     cumulative = np.cumsum(areas[own])
     face = own[np.searchsorted(cumulative, rng.uniform(0, cumulative[-1], count), side="right")]
     u, v = rng.uniform(size=(2, count))
