@@ -45,7 +45,10 @@ def metrics_record(
 
 
 def metrics_table(evaluation: Evaluation, before: Evaluation | None = None) -> str:
-    """The mean figures, one row each, for all, hands and face; before training in brackets."""
+    """The mean figures, one row each, for all, hands and face; before training in brackets.
+
+    Where training poses were given, the Chamfer distance of each third of the frames follows.
+    """
     head = f"{'held-out, ' + str(len(evaluation.per_frame)) + ' frames':24}"
     lines = [head + "".join(f"{region:>20}" for region in REGIONS)]
     for name, label, digits in _ROWS:
@@ -58,6 +61,13 @@ def metrics_table(evaluation: Evaluation, before: Evaluation | None = None) -> s
         lines.append(row)
     if before is not None:
         lines.append("in brackets: before training, the body's mean shape")
+    groups = evaluation.by_pose_distance()
+    if groups:
+        lines.append("Chamfer (mm), by distance to the nearest training pose")
+    for name, group in groups.items():
+        distances = group.pose_distance or ()
+        row = f"{f'{name}, {min(distances):.0f} to {max(distances):.0f} degrees':24}"
+        lines.append(row + "".join(f"{getattr(group.mean.cd_mm, r):>20.2f}" for r in REGIONS))
     return "\n".join(lines)
 
 
