@@ -81,7 +81,7 @@ def test_frames_within_three_centimetres_are_taken_without_a_word(case):
 def test_many_misfits_are_counted_and_the_worst_are_listed(case):
     found = [(f"f{k}", 0.01 * k) for k in range(12)]
     with pytest.warns(TrainingNotice, match=r"12 of 40 .* f11 \(11\.0 cm\).*f4 .* and 4 more\."):
-        FrameCheck(case[0], misfits=found, seen=40).notify()
+        FrameCheck(case[0], misfits=found, seen=40).notify([])
 
 
 def test_meshes_inside_out_are_turned_round(case):
@@ -127,6 +127,23 @@ def test_constant_poses(case):
     learned, held = choose_frames(frames, replace(config, train_frames=5))
     assert len(set(learned)) == 5
     assert list(held) == [18, 19]
+
+
+def test_notices_are_kept_with_the_run(case, no_prefit, tmp_path):
+    """In its history, and in that of a run that goes on from its checkpoint."""
+    body, frames, config, _, _ = case
+    moved = np.array([0.2, 0, 0])
+    wrong = with_meshes(frames, lambda k, v, f: (v + moved * (k == 1), f[:, ::-1] if k else f))
+    kept = {"checkpoint": tmp_path / "run.npz", "body": body, "verbose": False}
+    with pytest.warns(TrainingNotice) as said:
+        done = xa.fit(wrong, replace(config, steps=2), **kept)
+    messages = [str(w.message) for w in said]
+    assert [m.split(" were ")[0].split(" do ")[0] for m in messages] == [
+        "1 of 3 frames", "2 of 3 meshes",
+    ]  # fmt: skip
+    assert done.history.notices == messages
+    again = xa.fit(wrong, replace(config, steps=2), resume=True, **kept)
+    assert again.history.notices == messages
 
 
 def test_a_single_frame(case, no_prefit):

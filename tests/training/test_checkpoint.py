@@ -128,7 +128,9 @@ def test_nothing_to_go_on_from_is_said(job, tmp_path):
     call, _, config = job
     short = replace(config, minutes=0.0)
     with pytest.warns(TrainingNotice, match=r"no checkpoint at .*run\.npz: .* step 0"):
-        call(config=short, checkpoint=tmp_path / "run.npz", resume=True)
+        done = call(config=short, checkpoint=tmp_path / "run.npz", resume=True)
+    assert "begins at step 0" in done.history.notices[0]
+    assert (done.history.stopped, done.history.steps_done) == ("minutes", 0)
     with pytest.raises(ValueError, match="needs checkpoint"):
         call(config=short, resume=True)
 

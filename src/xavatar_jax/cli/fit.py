@@ -225,7 +225,7 @@ def run(options: Options) -> None:
         stages={name: round(value, 2) for name, value in stages.items()},
         training=training_record(result),
         data=capture.name,
-        notices=list(capture.notices),
+        notices=[*capture.notices, *history.notices],
     )
     report.write_json(out / "metrics.json", record)
     if verbose:

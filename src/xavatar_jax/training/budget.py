@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
 
 from ..files import load_arrays
-from .check import TrainingNotice
+from .check import notify
 from .config import FitConfig
 
 _LEAST_FRAMES = 24
@@ -31,14 +30,14 @@ def frames_in_budget(config: FitConfig) -> int:
     return min(config.train_frames, most) if config.train_frames else most
 
 
-def say_fewer_frames(config: FitConfig, learned: int, wanted: int) -> None:
-    """**Warns:** `TrainingNotice` if the budget left frames out."""
+def say_fewer_frames(config: FitConfig, learned: int, wanted: int, record: list[str]) -> None:
+    """Say (see `notify`) if the budget left frames out."""
     if learned < wanted:
-        warnings.warn(
+        notify(
             f"{learned} of {wanted} frames are learned from: {config.minutes:g} minutes would "
             f"go into labelling the others (frames_per_minute={config.frames_per_minute}; 0 takes "
             "them all).",
-            TrainingNotice,
+            record,
             stacklevel=5,
         )
 

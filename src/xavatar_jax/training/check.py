@@ -21,6 +21,12 @@ class TrainingNotice(UserWarning):
     """Something about a training run was assumed, or looks wrong."""
 
 
+def notify(message: str, record: list[str], *, stacklevel: int) -> None:
+    """Warn (`TrainingNotice`), and add the message to the run's record."""
+    warnings.warn(message, TrainingNotice, stacklevel=stacklevel + 1)
+    record.append(message)
+
+
 @dataclass
 class FrameCheck:
     """What was seen of the frames so far; `notify` says it."""
@@ -39,24 +45,24 @@ class FrameCheck:
         if frame.turned:
             self.turned.append(frame.source)
 
-    def notify(self) -> None:
-        """Warn (`TrainingNotice`) of frames that do not fit, and of meshes turned round."""
+    def notify(self, record: list[str]) -> None:
+        """Say (see `notify`) which frames do not fit, and which meshes were turned round."""
         if self.misfits:
             worst = sorted(self.misfits, key=lambda entry: -entry[1])
             names = [f"{source} ({100 * distance:.1f} cm)" for source, distance in worst]
-            warnings.warn(
+            notify(
                 f"{len(names)} of {self.seen} frames do not fit their parameters: half of the "
                 f"posed body is more than {100 * MISFIT_M:.0f} cm from the mesh in "
                 f"{_listed(names)}. Training goes on; leave these frames out, or look for wrong "
                 "parameters, units or axes.",
-                TrainingNotice,
+                record,
                 stacklevel=3,
             )
         if self.turned:
-            warnings.warn(
+            notify(
                 f"{len(self.turned)} of {self.seen} meshes were inside out and have been turned "
                 f"round: {_listed(self.turned)}.",
-                TrainingNotice,
+                record,
                 stacklevel=3,
             )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from .._version import __version__
 from ..body import BodyModel, BodyParams
 from ..files import flatten_named, load_arrays, refuse_newer, save_arrays, unflatten_named
-from .check import TrainingNotice
+from .check import notify
 from .config import FitConfig, config_from_dict, config_to_dict
 from .history import History
 from .pool import FramePool
@@ -139,12 +138,15 @@ class Checkpoint:
         }
 
 
-def load_checkpoint(path: str | os.PathLike[str], identity: RunIdentity) -> Checkpoint:
+def load_checkpoint(
+    path: str | os.PathLike[str], identity: RunIdentity, notices: list[str] | None = None
+) -> Checkpoint:
     """Read a checkpoint of this run.
 
     **Raises:** `FileNotFoundError`; `ValueError` naming the file if it is damaged, no checkpoint,
     from a newer version, or of another run, and then what differs.
-    **Warns:** `TrainingNotice` where versions or devices differ: then numbers may, too.
+    **Warns:** `TrainingNotice` where versions or devices differ: then numbers may, too. The
+    message is added to `notices`.
     """
     name = os.fspath(path)
     if not Path(path).exists():
@@ -176,10 +178,10 @@ def load_checkpoint(path: str | os.PathLike[str], identity: RunIdentity) -> Chec
         if versions.get(what) != old
     ]
     if other:
-        warnings.warn(
+        notify(
             f"{name}: written with {', '.join(other)}. The run goes on, but its numbers may "
             "differ in their last digits from those of an uninterrupted one.",
-            TrainingNotice,
+            [] if notices is None else notices,
             stacklevel=3,
         )
     return Checkpoint(name, arrays, header)

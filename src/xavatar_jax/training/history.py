@@ -20,6 +20,7 @@ class History:
     - `frames`: how many were learned from; `planned`: steps that the minutes were found to hold,
       where the schedule falls (0: not planned).
     - `found`: share of points with a root, where roots are stored.
+    - `notices`: what was said of the frames or the checkpoint.
     """
 
     steps: list[int] = field(default_factory=list)
@@ -33,6 +34,7 @@ class History:
     frames: int = 0
     planned: int = 0
     found: float = float("nan")
+    notices: list[str] = field(default_factory=list)
 
     def lap(self, stage: str, since: float) -> float:
         """Book the time since `since` on a stage; returns now."""

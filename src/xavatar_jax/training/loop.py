@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from ..body import BodyModel, check_params
 from ..frames import Frames
 from ..sampling import varied_frames
 from .budget import as_begun, frames_in_budget, say_fewer_frames
-from .check import TrainingNotice
 from .checkpoint import Keeper, load_checkpoint, run_identity
 from .config import FitConfig, check_start
 from .devices import ONE_DEVICE, Devices, share_work
@@ -65,18 +63,20 @@ def fit_fields(
     check_terms(terms or {})
     sharing = share_work(config, devices)
     begun = as_begun(config, checkpoint) if resume and checkpoint is not None else config
-    learned, held = choose_frames(frames, begun)
+    keeper, notices = None, []
+    learned, held = choose_frames(frames, begun, notices)
     chosen = frames[np.concatenate([learned, held])]
-    keeper = None
     if checkpoint is not None:
         identity = run_identity(body, chosen.params, betas, config)
-        saved = load_checkpoint(checkpoint, identity) if _goes_on(checkpoint, resume) else None
+        goes_on = _goes_on(checkpoint, resume, notices)
+        saved = load_checkpoint(checkpoint, identity, notices) if goes_on else None
         keeper = Keeper(Path(checkpoint), identity, saved)
     elif resume:
         raise ValueError("resume=True needs checkpoint=FILE, the file to go on from")
     history = History(frames=len(learned))
     if keeper is not None and keeper.saved is not None:
         history = keeper.saved.history()
+    history.notices += notices
     lines = None
     if log is not None and jax.process_index() == 0:
         lines = JsonLines(log, after=None if not history.steps_done else history.steps_done)
@@ -94,7 +94,7 @@ def fit_fields(
         pool = keeper.saved.pool(centred(chosen.params))
     if pool is None:
         with progress("points", len(chosen), verbose=verbose, unit="frame") as bar:
-            pool = label_frames(body, chosen, config, bar=bar)
+            pool = label_frames(body, chosen, config, bar=bar, notices=history.notices)
         clock = history.lap("labels", clock)
         if config.search.cached:
             with progress("roots", len(chosen), verbose=verbose, unit="frame") as bar:
@@ -125,17 +125,19 @@ def fit_fields(
 
 
 def choose_frames(
-    frames: Frames, config: FitConfig
+    frames: Frames, config: FitConfig, notices: list[str] | None = None
 ) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
     """Indices of the frames to learn from, chosen for their variety, and of those to be judged by.
 
     The latter are of the end of each sequence, and none of the former is.
 
-    **Warns:** `TrainingNotice` if `minutes` leave out frames that were asked for.
+    **Warns:** `TrainingNotice` if `minutes` leave out frames that were asked for; what it says is
+    added to `notices`.
     """
     rows, held = split_validation(frames, config.validation)
     count = min(frames_in_budget(config) or len(rows), len(rows))
-    say_fewer_frames(config, count, min(config.train_frames or len(rows), len(rows)))
+    wanted = min(config.train_frames or len(rows), len(rows))
+    say_fewer_frames(config, count, wanted, [] if notices is None else notices)
     return rows[varied_frames(frames.params[rows], count)], held
 
 
@@ -195,13 +197,13 @@ def subject_betas(frames: Frames) -> np.ndarray:
     return np.asarray(frames.params.betas).mean(0)
 
 
-def _goes_on(checkpoint: str | os.PathLike[str], resume: bool) -> bool:
+def _goes_on(checkpoint: str | os.PathLike[str], resume: bool, notices: list[str]) -> bool:
     """Whether there is something to go on from."""
     if not resume or Path(checkpoint).exists():
         return resume
-    warnings.warn(
+    notify(
         f"no checkpoint at {os.fspath(checkpoint)}: the run begins at step 0.",
-        TrainingNotice,
+        notices,
         stacklevel=4,
     )
     return False

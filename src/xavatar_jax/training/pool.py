@@ -63,13 +63,21 @@ def frame_labels(body: BodyModel, frame: Frame) -> Int[np.ndarray, " V"]:
     return nearest_part_labels(body, frame.params, frame.vertices)
 
 
-def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any) -> FramePool:
+def label_frames(
+    body: BodyModel,
+    frames: Frames,
+    config: FitConfig,
+    *,
+    bar: Any,
+    notices: list[str] | None = None,
+) -> FramePool:
     """Draw and label the points of every frame. Roots come later.
 
     One mesh is held at a time, and memory grows with the points kept: 29 bytes each, with their
     roots. Draws are keyed by seed and place in `frames`.
 
-    **Warns:** `TrainingNotice` naming frames whose mesh and parameters do not fit.
+    **Warns:** `TrainingNotice` naming frames whose mesh and parameters do not fit; the messages
+    are added to `notices`.
     """
     points, parts, distance = [], [], []
     check = FrameCheck(body)
@@ -83,7 +91,7 @@ def label_frames(body: BodyModel, frames: Frames, config: FitConfig, *, bar: Any
         parts.append(samples.parts.astype(np.int8))
         distance.append(samples.distance)
         bar.update(1)
-    check.notify()
+    check.notify([] if notices is None else notices)
     params = centred(frames.params)
     transforms = _bone_transforms(body, params)
     shape = (len(points), len(points[0]))
