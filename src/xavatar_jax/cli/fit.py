@@ -212,7 +212,7 @@ def run(options: Options) -> None:
         "data": loaded - started + sum(stages.get(k, 0) for k in ("settle", "labels", "roots")),
         "prefit": stages["prefit"],
         "compile": stages.get("compile", 0.0),
-        "train": sum(stages.get(k, 0) for k in ("train", "validation", "checkpoint")),
+        "train": sum(stages.get(k, 0) for k in ("train", "validation", "checkpoint", "redraw")),
         "evaluate": evaluated - fitted,
         "pictures": finished - evaluated,
         "total": finished - started,

@@ -135,6 +135,8 @@ class FitConfig:
     - `skinning_every`, `skinning_points`: with stored roots, every so many steps the skinning
       field is updated from so many points a frame; the other steps update the geometry.
     - `polish_every`: steps after which stored roots follow the skinning field.
+    - `redraw_every`, `redraw_frames`: every so many steps the points of so many frames are drawn
+      anew, one frame after another (0: never).
     - `prefit_steps`: steps that fit the geometry to the body's mean shape first, cached.
     - `report_every`: steps after which terms are recorded, and log and callback are served.
     - `checkpoint_every`: steps after which a checkpoint is written, where one is asked for.
@@ -151,6 +153,8 @@ class FitConfig:
     skinning_every: int = 4
     skinning_points: int = 128
     polish_every: int = 400
+    redraw_every: int = 0
+    redraw_frames: int = 8
     prefit_steps: int = 200
     report_every: int = 25
     checkpoint_every: int = 250

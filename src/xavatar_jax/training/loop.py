@@ -26,6 +26,7 @@ from .objective import ExtraTerms, check_terms
 from .pool import FramePool, centred, find_roots, label_frames
 from .prefit import initial_fields
 from .progress import progress
+from .redraw import Redraw
 from .run import Callback, Fitted, Run
 from .validation import split_validation
 
@@ -101,6 +102,9 @@ def fit_fields(
                 pool = find_roots(body, betas, start.skinning, pool, config, bar=bar)
             history.found = float(pool.found.mean() / pool.points.shape[1])
             history.lap("roots", clock)
+    redraw = None
+    if config.redraw_every:
+        redraw = Redraw(body, frames[learned], betas, config, start.skinning)
     try:
         return train_pool(
             body,
@@ -119,8 +123,11 @@ def fit_fields(
             log=lines,
             devices=sharing,
             terms=terms,
+            redraw=redraw,
         )
     finally:
+        if redraw is not None:
+            redraw.close()
         history.lap("total", started)
 
 
@@ -160,12 +167,14 @@ def train_pool(
     log: JsonLines | None = None,
     devices: Devices = ONE_DEVICE,
     terms: ExtraTerms | None = None,
+    redraw: Redraw | None = None,
 ) -> Fitted:
     """Train fields on points that are labelled already, for `config.steps` or as time allows.
 
     `seconds` counts training steps without compilation; `deadline` is a time of
     `time.perf_counter`. The last `held` frames of the pool are for validation. `start` is what
-    training begins from; `initial`, if it differs, what the result calls its step 0.
+    training begins from; `initial`, if it differs, what the result calls its step 0. `redraw`
+    makes new points while steps go on.
 
     **Raises:** as `fit_fields`.
     """
@@ -188,6 +197,7 @@ def train_pool(
         log=log,
         devices=devices,
         terms=terms,
+        redraw=redraw,
     )
     return run.to_the_end(verbose=verbose)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -22,7 +23,7 @@ from ..fields import (
 )
 from ..frames import Frame, Frames, nearest_part_labels
 from ..kinematics import skin_points, solve_3x3
-from ..sampling import sample_frame
+from ..sampling import FrameSamples, sample_frame
 from .check import FrameCheck
 from .config import FitConfig, SearchConfig
 
@@ -37,6 +38,7 @@ class FramePool(eqx.Module):
       rows, with `others_valid`.
     - `found`, `several`: `(F,)` rows that have a root, and more than one.
     - `transforms`: `(F, J, 4, 4)`; `params`: batched over F.
+    - `share`: of the points with a root, those with several, when roots were first searched.
     """
 
     points: Float[Array, "F N 3"]
@@ -49,6 +51,7 @@ class FramePool(eqx.Module):
     several: Int[Array, " F"]
     transforms: Float[Array, "F J 4 4"]
     params: BodyParams
+    share: Float[Array, ""] | None = None
 
 
 def centred(params: BodyParams) -> BodyParams:
@@ -79,31 +82,45 @@ def label_frames(
     **Warns:** `TrainingNotice` naming frames whose mesh and parameters do not fit; the messages
     are added to `notices`.
     """
-    points, parts, distance = [], [], []
+    drawn = []
     check = FrameCheck(body)
     for k in range(len(frames)):
         frame = frames[k]
         check.look(frame)
-        rng = np.random.default_rng((config.seed, k))
-        samples = sample_frame(frame, frame_labels(body, frame), config.points, rng)
-        shift = np.asarray(frame.params.transl, np.float32)
-        points.append(samples.points - shift)
-        parts.append(samples.parts.astype(np.int8))
-        distance.append(samples.distance)
+        drawn.append(draw_points(body, frame, config, place=k))
         bar.update(1)
     check.notify([] if notices is None else notices)
-    params = centred(frames.params)
+    return pool_of(body, drawn, frames.params)
+
+
+def draw_points(
+    body: BodyModel, frame: Frame, config: FitConfig, *, place: int, round_number: int = 0
+) -> FrameSamples:
+    """Labelled points of one frame, without its translation: a function of seed, place and round.
+
+    Round 0 is the first drawing.
+    """
+    key = (config.seed, place, round_number) if round_number else (config.seed, place)
+    rng = np.random.default_rng(key)
+    samples = sample_frame(frame, frame_labels(body, frame), config.points, rng)
+    shift = np.asarray(frame.params.transl, np.float32)
+    return samples._replace(points=samples.points - shift, parts=samples.parts.astype(np.int8))
+
+
+def pool_of(body: BodyModel, drawn: Sequence[FrameSamples], params: BodyParams) -> FramePool:
+    """A pool of points of frames with these parameters, without roots."""
+    params = centred(params)
     transforms = _bone_transforms(body, params)
-    shape = (len(points), len(points[0]))
+    count, size = len(drawn), len(drawn[0].points)
     return FramePool(
-        points=jnp.asarray(np.stack(points)),
-        parts=jnp.asarray(np.stack(parts)),
-        distance=jnp.asarray(np.stack(distance)),
-        root=jnp.zeros((*shape, 3)),
-        others=jnp.zeros((len(points), 1, 0, 3)),
-        others_valid=jnp.zeros((len(points), 1, 0), bool),
-        found=jnp.full(len(points), shape[1], jnp.int32),
-        several=jnp.zeros(len(points), jnp.int32),
+        points=jnp.asarray(np.stack([samples.points for samples in drawn])),
+        parts=jnp.asarray(np.stack([samples.parts for samples in drawn])),
+        distance=jnp.asarray(np.stack([samples.distance for samples in drawn])),
+        root=jnp.zeros((count, size, 3)),
+        others=jnp.zeros((count, 1, 0, 3)),
+        others_valid=jnp.zeros((count, 1, 0), bool),
+        found=jnp.full(count, size, jnp.int32),
+        several=jnp.zeros(count, jnp.int32),
         transforms=jnp.asarray(transforms, jnp.float32),
         params=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params),
     )
@@ -141,6 +158,18 @@ def find_roots(
 ) -> FramePool:
     """Search every point of the pool on the tabulated field, frame by frame."""
     table = tabulate_for_search(body, betas, skinning, config)
+    return search_roots(body, table, pool, config, bar=bar)
+
+
+def search_roots(
+    body: BodyModel,
+    table: TabulatedSkinning,
+    pool: FramePool,
+    config: FitConfig,
+    *,
+    bar: Any = None,
+) -> FramePool:
+    """The same on a field that is tabulated already."""
     starts = start_table(body.tree, config.search.starts)
     solver = ClosedFormNewton(atol=config.search.atol, divergence=1.0)
 
@@ -149,7 +178,8 @@ def find_roots(
         frame = pool.points[k], pool.parts[k], pool.transforms[k]
         x_c, valid = _search_frame(table, *frame, starts, solver, config.search)
         rows.append((np.asarray(x_c), np.asarray(valid)))
-        bar.update(1)
+        if bar is not None:
+            bar.update(1)
     return _ordered(pool, np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows]))
 
 
@@ -200,6 +230,7 @@ def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool
         several=jnp.asarray(several, jnp.int32),
         transforms=pool.transforms,
         params=pool.params,
+        share=jnp.asarray(several.sum() / max((count > 0).sum(), 1), jnp.float32),
     )
 
 

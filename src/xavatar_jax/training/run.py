@@ -28,6 +28,7 @@ from .model import AvatarFields
 from .objective import ExtraTerms, make_anchors
 from .pool import FramePool, polish_roots, tabulate_for_search
 from .progress import progress
+from .redraw import Redraw, put_rows
 from .step import make_steps, with_learned
 from .validation import Best, make_validation
 
@@ -67,6 +68,7 @@ class Run:
         log: JsonLines | None,
         devices: Devices,
         terms: ExtraTerms | None = None,
+        redraw: Redraw | None = None,
     ):
         self.clock = time.perf_counter()
         self.body, self.betas, self.start, self.initial = body, betas, start, initial
@@ -76,6 +78,7 @@ class Run:
         self.seconds, self.deadline = seconds, deadline
         self.callback, self.history, self.learned_from = callback, history, learned_from
         self.keeper, self.log, self.devices = keeper, log, devices
+        self.redraw = redraw
         self.first = jax.process_index() == 0  # of several hosts, the one that writes
 
         anchors = devices.replicate(make_anchors(body, jnp.asarray(betas), config))
@@ -109,6 +112,8 @@ class Run:
         self.began, self.trained = self.at, history.seconds.get("train", 0.0)
         self.compiled: set[str] = set()
         self.unchecked: tuple[int, dict[str, Any]] | None = None
+        if redraw is not None:
+            redraw.begin(self.at)
         self._write({"event": "start" if saved is None else "resume", **self._head()})
 
     def to_the_end(self, *, verbose: bool) -> Fitted:
@@ -162,8 +167,11 @@ class Run:
         polished = "skinning" in self.steps and k % config.polish_every == 0
         validated = self.validation is not None and k % config.validation.every == 0
         reported = k % self.config.report_every == 0
-        if polished or validated:
+        redrawn = 0 if self.redraw is None or k >= config.steps else self.redraw.round_at(k)
+        if polished or validated or redrawn:
             self._settle()
+        if redrawn:
+            self._take_redrawn(redrawn)
         if polished:
             self._polish()
         if validated:
@@ -238,6 +246,16 @@ class Run:
         pool = polish_roots(skinning, table, self.devices.collect(self.pool))
         self.pool = self.devices.replicate(pool)
 
+    def _take_redrawn(self, number: int) -> None:
+        """Replace the points of a few frames, and let the next ones be made."""
+        assert self.redraw is not None
+        self._book("train")
+        skinning = self.devices.collect(with_learned(self.base, self.state).skinning)
+        new = self.devices.replicate(self.redraw.take(number, skinning))
+        self.pool = put_rows(self.pool, new, self.redraw.rows(number))
+        self.redraw.begin(self.at)
+        self._book("redraw")
+
     def _validate(self) -> None:
         self._book("train")
         loss = self._ask()
@@ -271,7 +289,7 @@ class Run:
         if self.keeper is None or not self.first:
             return
         self._book("train")
-        pool = self.pool if self.config.search.cached else None
+        pool = self.pool if self.config.search.cached or self.redraw is not None else None
         self.keeper.save(self.state, self.best, self.history, pool, self.latest)
         self._book("checkpoint")
 

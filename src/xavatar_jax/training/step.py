@@ -124,8 +124,10 @@ def _uniform_index(
 
 def rows_with_several(pool: FramePool, points: int) -> int:
     """How many of a frame's drawn points are taken from those with several roots: their share."""
-    share = float(pool.several.sum() / jnp.maximum(pool.found.sum(), 1))
-    return min(int(np.ceil(points * share)), points)
+    share = pool.share
+    if share is None:
+        share = pool.several.sum() / jnp.maximum(pool.found.sum(), 1)
+    return min(int(np.ceil(points * float(share))), points)
 
 
 def make_steps(
