@@ -10,6 +10,7 @@ import pytest
 
 import xavatar_jax as xa
 from xavatar_jax.cli import fit
+from xavatar_jax.meshing import EmptyLevelSetError
 from xavatar_jax.training import TrainingError
 
 
@@ -105,6 +106,27 @@ def test_what_it_asks_of_the_library(call, tmp_path, monkeypatch, bundled_body):
     code, _, error = call("fit", "--out", file / "out")
     assert code == 2
     assert "is no folder" in error
+
+
+def test_a_field_without_a_surface_ends_it_with_advice(call, tmp_path, monkeypatch, bundled_body):
+    class Result(tuple):
+        frames = before = None
+
+    def evaluate(*_, **__):
+        raise EmptyLevelSetError("Everything is inside.")
+
+    avatar = SimpleNamespace(save=lambda path: None)
+    done = Result((avatar, SimpleNamespace(steps_done=3)))
+    capture = SimpleNamespace(body=bundled_body, name="case", train=[1], test=[2])
+    monkeypatch.setattr(xa, "synthetic_body", lambda *_: bundled_body)
+    monkeypatch.setattr(xa, "synthetic_capture", lambda *_, **__: capture)
+    monkeypatch.setattr(xa, "fit", lambda *_, **__: done)
+    monkeypatch.setattr(xa, "evaluate", evaluate)
+    code, _, error = call("fit", "--out", tmp_path, "--quiet")
+    assert code == 1
+    assert "after 3 steps" in error
+    assert "Everything is inside. The avatar and its checkpoint are in" in error
+    assert "--prefit-steps" in error
 
 
 @pytest.mark.usefixtures("coarse")

@@ -160,6 +160,7 @@ def load(options: Options) -> Capture:
 def run(options: Options) -> None:
     """Fit, evaluate, and write avatar, metrics, meshes and pictures."""
     from .. import report
+    from ..meshing import EmptyLevelSetError
     from ..render import save_png, save_webp_animation
 
     started = time.perf_counter()
@@ -190,12 +191,19 @@ def run(options: Options) -> None:
     avatar.save(out / "avatar.npz")
     fitted = time.perf_counter()
     # The held-out frames are read from here on, and nowhere before.
-    evaluation = xa.evaluate(
-        avatar, capture.test, learned_from=result.frames, num_frames=count, verbose=verbose
-    )
-    # Step 0 is only a reference: a quarter of the frames are enough for it.
-    few = max(len(evaluation.per_frame) // 4, 1)
-    before = xa.evaluate(result.before, capture.test, num_frames=few, verbose=verbose)
+    try:
+        evaluation = xa.evaluate(
+            avatar, capture.test, learned_from=result.frames, num_frames=count, verbose=verbose
+        )
+        # Step 0 is only a reference: a quarter of the frames are enough for it.
+        few = max(len(evaluation.per_frame) // 4, 1)
+        before = xa.evaluate(result.before, capture.test, num_frames=few, verbose=verbose)
+    except EmptyLevelSetError as error:
+        raise EmptyLevelSetError(
+            f"no surface to evaluate, after {history.steps_done} steps or at step 0: {error} The "
+            f"avatar and its checkpoint are in {out}; take more --steps (with --resume) or more "
+            "--prefit-steps."
+        ) from error
     evaluated = time.perf_counter()
     written = [out / "avatar.npz", out / "metrics.json", *write_meshes(avatar, capture.test, out)]
     sequence = next(iter(capture.test.sequences.values()))
