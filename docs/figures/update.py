@@ -34,6 +34,7 @@ METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
 ANIMATE = "animate.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
 FLOOR = "metric_floor.json"
+MEMORY = "memory.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
 
@@ -336,6 +337,17 @@ def floor_view(record: dict[str, Any]) -> str:
     return f"{_table(rows)}\n\n{_machine(header)}; {header['frames']} held-out frames."
 
 
+def memory_view(record: dict[str, Any]) -> str:
+    """Peaks of whole processes, in GiB, a row for each count of frames."""
+    stages = (("fit", "after learning"), ("all", "after an evaluation"))
+    rows = [["frames to learn from", "chosen", *(f"{label}, GiB" for _, label in stages)]]
+    for row in record["rows"]:
+        peaks = [f"{row[f'peak_rss_{name}_mb'] / 1024:.2f}" for name, _ in stages]
+        rows.append([f"{row['frames']:,}", str(row["learned_from"]), *peaks])
+    header = record["header"]
+    return f"{_table(rows)}\n\n{_machine(header)}; preset `quick`, {header['steps']} steps."
+
+
 def time_of_gradients_view(record: dict[str, Any]) -> str:
     """Roots and their derivatives by the field's parameters, milliseconds."""
     rows = [["method", "mode", "ms for 1000 points", "first call, s"]]
@@ -407,6 +419,7 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{GRADIENTS} float32": float32_view,
     f"docs/figures/{GRADIENTS} time": time_of_gradients_view,
     f"docs/figures/{FLOOR}": floor_view,
+    f"docs/figures/{MEMORY}": memory_view,
 }
 _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
@@ -465,6 +478,7 @@ def main() -> None:
     parser.add_argument("--correspondence", help="JSON of benchmarks/correspondence.py")
     parser.add_argument("--gradients", help="JSON of benchmarks/gradients.py")
     parser.add_argument("--metric-floor", help="JSON of benchmarks/metric_floor.py")
+    parser.add_argument("--memory", help="JSON of benchmarks/memory.py")
     args = parser.parse_args()
     if args.metrics:
         _store(args.metrics, METRICS, slim_metrics)
@@ -478,6 +492,8 @@ def main() -> None:
         _store(args.gradients, GRADIENTS, slim_benchmark)
     if args.metric_floor:
         _store(args.metric_floor, FLOOR, slim_benchmark)
+    if args.memory:
+        _store(args.memory, MEMORY, slim_benchmark)
     for name in TEXTS:
         path = ROOT / name
         path.write_text(filled(path.read_text("utf-8")), encoding="utf-8")
