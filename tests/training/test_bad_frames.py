@@ -136,13 +136,13 @@ def test_notices_are_kept_with_the_run(case, no_prefit, tmp_path):
     wrong = with_meshes(frames, lambda k, v, f: (v + moved * (k == 1), f[:, ::-1] if k else f))
     kept = {"checkpoint": tmp_path / "run.npz", "body": body, "verbose": False}
     with pytest.warns(TrainingNotice) as said:
-        done = xa.fit(wrong, replace(config, steps=2), **kept)
+        done = xa.fit(wrong, config, **kept)
     messages = [str(w.message) for w in said]
     assert [m.split(" were ")[0].split(" do ")[0] for m in messages] == [
         "1 of 3 frames", "2 of 3 meshes",
     ]  # fmt: skip
     assert done.history.notices == messages
-    again = xa.fit(wrong, replace(config, steps=2), resume=True, **kept)
+    again = xa.fit(wrong, config, resume=True, **kept)
     assert again.history.notices == messages
 
 
