@@ -13,7 +13,7 @@ SOURCE = Path(xavatar_jax.__file__).parent
 LAYERS = (
     *("files", "geometry", "kinematics", "body", "frames", "fields", "correspondence"),
     *("sampling", "losses", "training", "meshing", "export", "metrics", "avatar", "motion"),
-    *("datasets", "render", "report", "viewer"),
+    *("baselines", "datasets", "render", "report", "viewer"),
 )
 # Not packages of the library's stages: they may import everything.
 OUTSIDE = {"__init__", "__main__", "cli", "_version"}

@@ -5,6 +5,7 @@ from .animate import AnimationError as AnimationError
 from .avatar import Avatar as Avatar
 from .avatar import CellSizes as CellSizes
 from .evaluate import Evaluation as Evaluation
+from .evaluate import Posable as Posable
 from .evaluate import evaluate as evaluate
 from .fit import Fit as Fit
 from .fit import fit as fit

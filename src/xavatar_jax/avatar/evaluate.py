@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
+from jaxtyping import Float
 
+from ..body import BodyModel, BodyParams
 from ..frames import Frames, spread
 from ..meshing import Mesh
 from ..metrics import MeshMetrics, mean_metrics, surface_metrics
 from ..sampling import pose_distance
 from ..training.progress import progress
-from .avatar import Avatar
 
 GROUPS = ("near", "middle", "far")
+
+
+class Posable(Protocol):
+    """What can be evaluated: a person's surface in any pose of a body. An `Avatar` is one."""
+
+    @property
+    def body(self) -> BodyModel:
+        """The body that parameters are for, which tells hands and face from the rest."""
+        ...
+
+    def mesh(self, params: BodyParams, *, mode: Literal["fast", "full"] = "fast") -> Mesh:
+        """The posed surface of one frame, metres."""
+        ...
+
+    def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
+        """Vertices of the body itself in this pose and the person's shape, metres."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -70,7 +88,7 @@ class Evaluation:
 
 
 def evaluate(
-    avatar: Avatar,
+    avatar: Posable,
     frames: Frames,
     *,
     learned_from: Frames | None = None,
@@ -81,6 +99,7 @@ def evaluate(
 ) -> Evaluation:
     """Compare posed avatar meshes with the frames' own meshes.
 
+    `avatar` is an `Avatar`, or anything else that gives a mesh for a pose (`Posable`).
     `num_frames` are spread evenly over the sequences (None: all). Parts are those of the nearest
     vertex of the posed body, as in the reference's protocol. See `surface_metrics` for the
     figures. With `learned_from`, the frames of training (`Fit.frames`; only their poses are

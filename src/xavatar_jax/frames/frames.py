@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -169,6 +169,21 @@ class Frames(Sequence[Frame]):
         index = self.sequence_index
         order = dict.fromkeys(int(i) for i in index)
         return {self.sequence_names[i]: self[np.flatnonzero(index == i)] for i in order}
+
+    def with_params(self, params: BodyParams, body: BodyModel | None = None) -> Frames:
+        """The same meshes with other parameters, of another body.
+
+        Raises:
+            ValueError: another number of parameters than of frames, or some that are not finite.
+        """
+        if _batch_size(params) != len(self):
+            raise ValueError(f"parameters for {_batch_size(params)} frames; there are {len(self)}.")
+        check_finite(params, self.sources)
+        view = object.__new__(Frames)
+        view._sources = replace(self._sources, body=body)
+        view._params = params
+        view._index = self._index
+        return view
 
     def __len__(self) -> int:
         return len(self._index)

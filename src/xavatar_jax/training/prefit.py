@@ -37,14 +37,18 @@ def initial_fields(
     *,
     cache: str | os.PathLike[str] | None = None,
     verbose: bool = True,
+    fields: AvatarFields | None = None,
 ) -> AvatarFields:
     """Fields fitted to the mean shape of the body; kept in the cache folder, one a body and config.
 
-    The person's betas, correctives and frames play no part in it.
+    The person's betas, correctives and frames play no part in it. `fields` are of other classes
+    than those of the config, drawn by its seed.
     """
-    fields = fresh_fields(body, config)
+    own = [] if fields is None else [str(eqx.filter_eval_shape(lambda: fields))]
+    fields = fresh_fields(body, config) if fields is None else fields
     fingerprint = json.dumps(
         [
+            *own,
             __version__,
             _REVISION,
             body.source.checksum,

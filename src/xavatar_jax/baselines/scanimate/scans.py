@@ -1,0 +1,102 @@
+"""Scans as SCANimate sees them: triangles without the person's turn and place in the world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...body import BodyModel, BodyParams, bone_transforms, pose_body
+from ...fields import template_weights
+from ...frames import Frames
+from ...geometry import closest_points, face_normals, sample_surface, vertex_normals
+from .config import ScanimateConfig
+
+_TURN_M = 0.05  # how far away a right angle counts, roughly
+
+
+class Scans(eqx.Module):
+    """Triangles of F frames, T each, in the frame of the posed root, metres.
+
+    - `corners`: `(F, T, 3, 3)`; `known`: `(F, T, 3, J)` the template's weights at the nearest point
+      of the posed body.
+    - `transforms`: `(F, J, 4, 4)` from canonical space; `params`: batched over F.
+    """
+
+    corners: Float[Array, "F T 3 3"]
+    known: Float[Array, "F T 3 J"]
+    transforms: Float[Array, "F J 4 4"]
+    params: BodyParams
+
+
+def read_scans(
+    body: BodyModel, frames: Frames, betas: Any, config: ScanimateConfig, *, bar: Any
+) -> Scans:
+    """Draw `config.triangles` triangles of each frame by area, keyed by seed and place."""
+    shape = jnp.asarray(betas, frames.params.pose.dtype)
+    shapes = jnp.broadcast_to(shape, (len(frames), len(shape)))
+    params = eqx.tree_at(lambda p: p.betas, frames.params, shapes)
+    all_corners, all_known, all_transforms = [], [], []
+    for k in range(len(frames)):
+        frame = frames[k]
+        posed, transforms = (np.asarray(v, np.float64) for v in _posed(body, params[k]))
+        upright = np.linalg.inv(transforms[0])
+        rng = np.random.default_rng((config.seed, k))
+        _, chosen = sample_surface(frame.vertices, frame.faces, config.triangles, rng)
+        corners = np.asarray(frame.vertices, np.float64)[frame.faces[chosen]].reshape(-1, 3)
+        normals = np.repeat(face_normals(frame.vertices, frame.faces[chosen]), 3, axis=0)
+        known = nearest_weights(body, posed, corners, normals)
+        corners = corners @ upright[:3, :3].T + upright[:3, 3]
+        all_corners.append(corners.reshape(-1, 3, 3).astype(np.float32))
+        all_known.append(known.reshape(len(chosen), 3, -1).astype(np.float32))
+        all_transforms.append((upright @ transforms).astype(np.float32))
+        bar.update(1)
+    return Scans(
+        corners=jnp.asarray(np.stack(all_corners)),
+        known=jnp.asarray(np.stack(all_known)),
+        transforms=jnp.asarray(np.stack(all_transforms)),
+        params=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params),
+    )
+
+
+def nearest_weights(
+    body: BodyModel,
+    posed: Float[np.ndarray, "V 3"],
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+) -> Float[np.ndarray, "N J"]:
+    """The template's weights at the nearest point of the posed body that faces the same way.
+
+    Where parts touch, the nearest point is often the other part's, which faces the other way:
+    there the nearest vertex counts, with the difference of normals as a distance of centimetres.
+    """
+    from scipy.spatial import cKDTree
+
+    weights = template_weights(body, posed, points)
+    _, face, _ = closest_points(posed, body.faces, points)
+    away = np.flatnonzero((face_normals(posed, body.faces)[face] * normals).sum(1) < 0)
+    if len(away):
+        tree = cKDTree(np.concatenate([posed, _TURN_M * vertex_normals(posed, body.faces)], 1))
+        _, vertex = tree.query(np.concatenate([points, _TURN_M * normals], 1)[away])
+        weights[away] = np.asarray(body.weights, np.float64)[vertex]
+    return weights
+
+
+@eqx.filter_jit
+def _posed(body: BodyModel, params: BodyParams) -> tuple[Array, Array]:
+    return pose_body(body, params).vertices, bone_transforms(body, params)
+
+
+def edge_stretch(
+    before: Float[np.ndarray, "*n 3 3"], after: Float[np.ndarray, "*n 3 3"]
+) -> Float[np.ndarray, "*n"]:
+    """By how much the most changed edge of each triangle is longer or shorter: one or more."""
+    first, second = (
+        np.linalg.norm(t - np.roll(t, 1, axis=-2), axis=-1) + 1e-9 for t in (before, after)
+    )
+    ratio = second / first
+    return np.maximum(ratio, 1 / ratio).max(-1)
