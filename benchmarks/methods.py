@@ -1,13 +1,14 @@
 """The methods that tables compare: `METHODS[name](frames, minutes, seed)`.
 
 A call learns from frames within so many minutes, counted from it, and gives something that
-`xa.evaluate` takes. Fields fitted to the body's mean shape are no part of it: `prepare` makes
-those of a method and seed before, and they are kept in the cache folder. They know nothing of the
-person.
+`xa.evaluate` takes. All that a method does is part of them, the fit of its first fields to the
+body's mean shape included; but the paper's networks take long to fit, and have theirs from the
+cache folder, where `prepare` puts them before.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,91 +30,88 @@ from xavatar_jax.body import BodyModel
 from xavatar_jax.frames import Frames
 from xavatar_jax.training import FitConfig, initial_fields
 
-# Seconds on two cores: a run's compilation, a frame's points and roots, a step of the grids.
-_COMPILE_S, _FRAME_S, _STEP_S = 20.0, 0.5, 0.11
-_SCAN_S = 0.2  # a frame as SCANimate reads it
-_FRAMES_SHARE = 0.4  # of the time, for reading frames
-_FEWEST = 12
+STEPS = 100_000  # more than any budget here holds: minutes decide
 
 
 @dataclass(frozen=True)
 class Method:
-    """How a method learns, and its config for a budget."""
+    """A function that learns, and its config.
+
+    `prepared`: first fields come from the cache folder, and are no part of the minutes.
+    """
 
     learn: Callable[..., Any]
-    config: Callable[[float, int], Any]
+    preset: Callable[[], Any]
+    prepared: bool = False
 
     def __call__(
-        self, frames: Frames, minutes: float, seed: int, *, cache: str | None = None
+        self,
+        frames: Frames,
+        minutes: float,
+        seed: int,
+        *,
+        small: bool = False,
+        cache: str | None = None,
     ) -> Posable:
-        found = self.learn(frames, self.config(minutes, seed), cache=cache, verbose=False)
+        config = self.config(minutes, seed, small)
+        if self.prepared:
+            found = self.learn(frames, config, cache=cache, verbose=False)
+        else:
+            with tempfile.TemporaryDirectory() as empty:
+                found = self.learn(frames, config, cache=empty, verbose=False)
         return found.avatar if self.learn is xa.fit else found
 
-
-def for_minutes(config: FitConfig, minutes: float, seed: int) -> FitConfig:
-    """As many frames and steps as two cores have time for; the clock ends what takes longer.
-
-    Steps matter where the rate falls with them. A network's rate stays, and it goes on to the end.
-    """
-    seconds = max(60 * minutes - _COMPILE_S, 10.0)
-    frames = _frames(config.train_frames, seconds, _FRAME_S)
-    steps = config.steps
-    if config.optimiser.schedule == "cosine":
-        steps = max(int((seconds - _FRAME_S * frames) / _STEP_S), 50)
-    return replace(config, minutes=minutes, seed=seed, train_frames=frames, steps=steps)
-
-
-def scans_for_minutes(config: ScanimateConfig, minutes: float, seed: int) -> ScanimateConfig:
-    """The same for SCANimate, whose stages go by the clock."""
-    seconds = max(60 * minutes - _COMPILE_S, 10.0)
-    stages = {
-        name: replace(stage, steps=10**6) if stage.steps else stage
-        for name, stage in (("skin", config.skin), ("cycle", config.cycle), ("shape", config.shape))
-    }
-    return replace(
-        config,
-        minutes=minutes,
-        seed=seed,
-        start=replace(config.start, seed=seed),
-        train_frames=_frames(config.train_frames, seconds, _SCAN_S),
-        **stages,
-    )
+    def config(self, minutes: float, seed: int, small: bool) -> Any:
+        """The preset, ended by time alone; `small`, by a few steps."""
+        config = self.preset()
+        if isinstance(config, ScanimateConfig):
+            stages = {name: getattr(config, name) for name in ("skin", "cycle", "shape")}
+            return replace(
+                config,
+                seed=seed,
+                minutes=None if small else minutes,
+                train_frames=3 if small else config.train_frames,
+                start=_configured(config.start, minutes, seed, small),
+                **{
+                    name: replace(stage, steps=min(stage.steps, 6) if small else STEPS)
+                    for name, stage in stages.items()
+                    if stage.steps
+                },
+            )
+        return _configured(config, minutes, seed, small)
 
 
-def _frames(most: int, seconds: float, each: float) -> int:
-    count = max(int(_FRAMES_SHARE * seconds / each), _FEWEST)
-    return min(count, most) if most else count
+def _configured(config: FitConfig, minutes: float, seed: int, small: bool) -> FitConfig:
+    if small:
+        return replace(config, seed=seed, steps=6, train_frames=3, prefit_steps=20)
+    return replace(config, seed=seed, steps=STEPS, minutes=minutes)
 
 
-def _template() -> FitConfig:
+def _template_weights() -> FitConfig:
     config = xa.quick()
     return replace(config, skinning=replace(config.skinning, learned=False))
 
 
-def _library(learn: Callable[..., Any], preset: Callable[[], FitConfig]) -> Method:
-    return Method(learn, lambda minutes, seed: for_minutes(preset(), minutes, seed))
-
-
-def _scanimate(preset: Callable[[], ScanimateConfig]) -> Method:
-    return Method(fit_scanimate, lambda minutes, seed: scans_for_minutes(preset(), minutes, seed))
-
-
 METHODS: dict[str, Method] = {
-    "quick": _library(xa.fit, xa.quick),
-    "template weights": _library(xa.fit, _template),
-    "paper": _library(xa.fit, xa.paper),
-    "SNARF": _library(fit_snarf, snarf_quick),
-    "SNARF, paper": _library(fit_snarf, snarf_paper),
-    "SCANimate": _scanimate(scanimate_quick),
-    "SCANimate, paper": _scanimate(scanimate_paper),
+    "quick": Method(xa.fit, xa.quick),
+    "template weights": Method(xa.fit, _template_weights),
+    "SNARF": Method(fit_snarf, snarf_quick),
+    "SCANimate": Method(fit_scanimate, scanimate_quick),
+    "paper": Method(xa.fit, xa.paper, prepared=True),
+    "SNARF, paper": Method(fit_snarf, snarf_paper, prepared=True),
+    "SCANimate, paper": Method(fit_scanimate, scanimate_paper, prepared=True),
 }
-"""By the names they have in tables; of the baselines, those without a word are for two cores."""
+"""By the names they have in tables. Baselines without a word are in their size for two cores."""
 
 
-def prepare(name: str, body: BodyModel, seed: int, *, cache: str | None = None) -> None:
-    """Fit a method's fields to the body's mean shape, if the cache folder has none yet."""
+def prepare(
+    name: str, body: BodyModel, seed: int, *, small: bool = False, cache: str | None = None
+) -> None:
+    """Fit a method's first fields into the cache folder, if they are to come from there."""
     method = METHODS[name]
-    config = method.config(1.0, seed)
+    if not method.prepared:
+        return
+    config = method.config(1.0, seed, small)
     if method.learn is xa.fit:
         initial_fields(body, config, cache=cache)
     elif method.learn is fit_snarf:

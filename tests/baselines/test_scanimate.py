@@ -142,6 +142,10 @@ def test_networks_give_weights_and_a_local_condition(rng):
     chain = KinematicTree(tuple("abcdefgh"), (-1, *range(7)))
     weights = Constant(jnp.eye(8)[0])
     network = LocalPoseMLP(chain, weights, SMALL, softness=0.004, key=key)
+    # The pose is silent at first: let the first layer hear all of its inputs.
+    first = network.mlp.layers[0].direction
+    loud = jnp.asarray(rng.standard_normal(first.shape), first.dtype)
+    network = eqx.tree_at(lambda n: n.mlp.layers[0].direction, network, loud)
     pose = jnp.zeros((8, 3))
     params = xa.BodyParams(pose, jnp.zeros(0), jnp.zeros(0), jnp.zeros(3), chain)
 
@@ -235,7 +239,7 @@ def test_touching_parts_keep_their_own_weights(family):
     plate = np.stack([x.ravel(), y.ravel(), np.zeros(16)], 1)
     cells = np.array([[k, k + 4, k + 1] for k in range(11) if k % 4 < 3])
     cells = np.concatenate([cells, [[k + 4, k + 5, k + 1] for k in range(11) if k % 4 < 3]])
-    vertices = np.concatenate([plate, plate + [0, 0, 0.001]])
+    vertices = np.concatenate([plate, plate + np.array([0, 0, 0.001])])
     # The lower plate faces upwards, the upper one downwards.
     faces = np.concatenate([cells, cells[:, ::-1] + 16]).astype(np.int32)
     weights = np.zeros((32, 3))

@@ -47,6 +47,7 @@ from .objective import (
 from .scans import Scans, edge_stretch, read_scans
 
 _REPORT_EVERY = 25
+_LEAST_FRAMES = 24
 
 
 def fit_scanimate(
@@ -70,7 +71,7 @@ def fit_scanimate(
     started = time.perf_counter()
     whole = known_body(frames, body)
     cut = body_only(whole)
-    count = config.train_frames or len(frames)
+    count = _frames_in_budget(config, len(frames))
     learned_from = body_only_frames(cut, frames[varied_frames(frames.params, count)])
     betas = subject_betas(frames)
     history = History()
@@ -115,6 +116,14 @@ def fit_scanimate(
     learned = AvatarFields(nets.forward, geometry)
     avatar = Avatar(cut, betas, learned, config.start, history.steps_done)
     return Baseline(whole, avatar, history, learned_from)
+
+
+def _frames_in_budget(config: ScanimateConfig, most: int) -> int:
+    """How many frames to learn from. Told by the config alone: no draw depends on a clock."""
+    count = config.train_frames or most
+    if config.minutes is not None and config.frames_per_minute:
+        count = min(count, max(round(config.minutes * config.frames_per_minute), _LEAST_FRAMES))
+    return min(count, most)
 
 
 def start_fields(

@@ -38,7 +38,7 @@ def static_hands(
         fingers = [j for j in whole.tree.subtree(wrist) if j != wrist]
         pose[fingers] = np.asarray(params.pose).mean(0)[fingers]
     own = BodyParams.create(whole, pose=pose, betas=betas)
-    corners = np.asarray(pose_body(whole, own).vertices)[faces[on_hand]]
+    corners = np.asarray(pose_body(whole, own).vertices, np.float64)[faces[on_hand]]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
     return corners, area / area.sum()
