@@ -18,6 +18,7 @@ from xavatar_jax.baselines import (
     snarf_paper,
     snarf_quick,
 )
+from xavatar_jax.baselines.scanimate.fields import LocalPoseMLP
 from xavatar_jax.fields import GridSpacing
 from xavatar_jax.frames import frames_from_params
 from xavatar_jax.training import prefit
@@ -104,6 +105,8 @@ def test_scanimate_learns(start, frames, cache):
 def test_scanimates_own_networks_learn(start, frames, cache):
     """Stages 1 to 3 with networks in place of grids, and losses on derivatives."""
     config = scanimate_paper()
+    assert config.forward is not None
+    assert config.distance is not None
     networks = replace(
         config.start,
         prefit_steps=40,
@@ -129,6 +132,7 @@ def test_scanimates_own_networks_learn(start, frames, cache):
     assert {"skin_scan", "cycle_cycle", "shape_normal", "shape_eikonal"} <= set(terms)
     assert "shape_offset" not in terms
     fields = found.avatar.fields
+    assert isinstance(fields.geometry, LocalPoseMLP)
     assert eqx.tree_equal(fields.geometry.skinning, fields.skinning)
 
 
@@ -138,6 +142,8 @@ def test_paper_settings_are_the_published_sizes():
     assert (config.skinning.mlp.width, config.skinning.mlp.depth) == (128, 4)
     assert config.points.total == config.points_per_step == 2250
     config = scanimate_paper()
+    assert config.forward is not None
+    assert config.distance is not None
     assert (config.forward.width, config.forward.depth) == (256, 3)
     assert (config.inverse.width, config.latent) == (256, 64)
     assert (config.distance.width, config.distance.depth) == (512, 6)

@@ -320,15 +320,18 @@ def _learned(model: Any, config: ScanimateConfig) -> Any:
 
 
 def _skin_loss(nets: SkinNets, constant: Any, config: Any, done: Any, key: Any):
-    return skin_objective(nets, *constant, config, done, key, cycle=False)
+    scans, template = constant
+    return skin_objective(nets, scans, template, config, done, key, cycle=False)
 
 
 def _cycle_loss(nets: SkinNets, constant: Any, config: Any, done: Any, key: Any):
-    return skin_objective(nets, *constant, config, done, key, cycle=True)
+    scans, template = constant
+    return skin_objective(nets, scans, template, config, done, key, cycle=True)
 
 
 def _shape_loss(geometry: Any, constant: Any, config: Any, done: Any, key: Any):
-    return shape_objective(geometry, *constant, config, key)
+    scans, template = constant
+    return shape_objective(geometry, scans, template, config, key)
 
 
 def _check(values: dict[str, float], name: str, step: int) -> None:

@@ -167,7 +167,7 @@ def shape_objective(
 
 
 def _draw(
-    shape: tuple[int, int], stage: Stage, frame_key: PRNGKeyArray, row_key: PRNGKeyArray
+    shape: tuple[int, ...], stage: Stage, frame_key: PRNGKeyArray, row_key: PRNGKeyArray
 ) -> tuple[Int[Array, " B"], Int[Array, "B M"]]:
     """Random frames, and random triangles of each."""
     chosen = jax.random.randint(frame_key, (stage.frames,), 0, shape[0])
