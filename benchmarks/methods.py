@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Posable
+from xavatar_jax.avatar import Avatar, Posable
 from xavatar_jax.baselines import (
     ScanimateConfig,
     body_only,
@@ -118,3 +118,8 @@ def prepare(
         initial_fields(body_only(body), config, cache=cache)
     else:
         start_fields(body_only(body), config, cache=cache)
+
+
+def learned_steps(model: Any) -> int:
+    """Steps that the fields of a method's answer have seen."""
+    return model.steps if isinstance(model, Avatar) else model.avatar.steps

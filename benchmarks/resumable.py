@@ -14,35 +14,21 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import Any, Protocol, cast
+from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Float
 from search_problems import print_rows
 
 import xavatar_jax as xa
-from xavatar_jax.body import BodyModel, BodyParams
-from xavatar_jax.frames import Frames, posed_vertices
+from xavatar_jax.avatar import Posable
+from xavatar_jax.frames import Frames
 from xavatar_jax.report import describe_machine, write_json
 
 Job = Mapping[str, Any]
 Row = dict[str, Any]
-
-
-class Posable(Protocol):
-    """What a method gives: a mesh in any pose."""
-
-    def mesh(self, params: BodyParams) -> xa.Mesh: ...
-
-
-Method = Callable[[Frames, float, int], Posable]
-"""`method(frames, minutes, seed)`: learns from frames for so many minutes since the call."""
 
 
 def add_options(
@@ -179,27 +165,9 @@ def print_medians(
         print_rows(found, [*by, "seeds", *(columns or _figures(found, (*by, "seeds")))])
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """A method's answer with the body that tells hands from face, as `xa.evaluate` asks for."""
-
-    model: Posable
-    body: BodyModel
-    betas: Float[np.ndarray, " S"]
-
-    def mesh(self, params: BodyParams, *, mode: str = "fast") -> xa.Mesh:
-        return self.model.mesh(params)
-
-    def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
-        return posed_vertices(self.body, replace(params, betas=jnp.asarray(self.betas)))
-
-
-def score(
-    model: Posable, body: BodyModel, betas: Any, frames: Frames, count: int
-) -> dict[str, float | None]:
+def score(model: Posable, frames: Frames, count: int) -> dict[str, float | None]:
     """Held-out figures of `xa.evaluate`, named by figure and region: `cd_hands_mm` and so on."""
-    judged = cast(xa.Avatar, _Judged(model, body, np.asarray(betas)))
-    mean = xa.evaluate(judged, frames, num_frames=count, verbose=False).mean.to_json()
+    mean = xa.evaluate(model, frames, num_frames=count, verbose=False).mean.to_json()
     found = {}
     for figure in ("cd_mm", "cd_max_mm", "nc", "iou", "iou_box"):
         stem, unit = (figure[:-3], "_mm") if figure.endswith("_mm") else (figure, "")

@@ -25,7 +25,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from resumable import Row, add_options, every, fill, medians, score
 from search_problems import least_time
 
@@ -117,7 +116,7 @@ def measure(
     else:
         share = search_seconds(result, capture, config) / step_s
     return {
-        **score(avatar, capture.body, jnp.asarray(avatar.betas), capture.test, args.eval_frames),
+        **score(avatar, capture.test, args.eval_frames),
         "steps": history.steps_done,
         "best_step": history.best_step,
         "frames": history.frames,

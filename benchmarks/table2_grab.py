@@ -20,13 +20,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-from methods import METHODS, prepare
+from methods import METHODS, learned_steps, prepare
 from resumable import add_options, every, fill, score
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Avatar, Posable
+from xavatar_jax.avatar import Posable
 from xavatar_jax.frames import spread
-from xavatar_jax.training import subject_betas
 
 NAMES = ("quick", "template weights", "SNARF", "SCANimate")
 FIGURES = ("cd", "cd_max", "nc", "iou")
@@ -49,11 +48,6 @@ def measure_speed(model: Posable, frames: xa.Frames) -> float:
     return 1000 * (time.perf_counter() - clock) / (len(frames) - 1)
 
 
-def learned_steps(model: Any) -> int:
-    """Steps that the fields have seen."""
-    return model.steps if isinstance(model, Avatar) else model.avatar.steps
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -69,7 +63,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         capture = xa.load_data(args.data, body=body)
     else:
         capture = xa.synthetic_capture(args.cache_dir, body=body)
-    betas = subject_betas(capture.train)
     shown = capture.test[spread(capture.test, 4)]
 
     def run(name: str, seed: int) -> dict[str, Any]:
@@ -84,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             "fit_s": spent,
             "steps": learned_steps(model),
             "mesh_ms": measure_speed(model, shown),
-            **score(model, capture.body, betas, capture.test, eval_frames),
+            **score(model, capture.test, eval_frames),
         }
 
     fill(

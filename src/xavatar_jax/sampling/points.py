@@ -103,7 +103,7 @@ def sample_frame(
         spread = np.resize(np.asarray(sigmas), count)[:, None]
         if plan.uniform:
             fine = np.resize(np.asarray(plan.fine_sigma), count)[:, None]
-            spread = np.where((face_labels[face] == BODY)[:, None], spread, fine)
+            spread = np.where((place_labels[place] == BODY)[:, None], spread, fine)
         points.append(drawn + spread * rng.standard_normal((count, 3)))
         parts.append(place_labels[place])
     if plan.box:

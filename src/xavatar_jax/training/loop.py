@@ -16,6 +16,7 @@ from ..body import BodyModel, check_params
 from ..frames import Frames
 from ..sampling import varied_frames
 from .budget import as_begun, frames_in_budget, say_fewer_frames
+from .check import notify
 from .checkpoint import Keeper, load_checkpoint, run_identity
 from .config import FitConfig, check_start
 from .devices import ONE_DEVICE, Devices, share_work
