@@ -11,22 +11,31 @@ from helpers import COLUMNS, PARENTS, toy_arrays
 
 from xavatar_jax.body import load_body, synthetic_body
 
-# Folders whose files share a labelled pool or a learned avatar: most of a minute each to make.
-_TOGETHER = ("training", "avatar")
+# What takes longest begins.
+_FIRST = ("avatar", "training", "baselines", "viewer")
+_SHORT_RUNS = (
+    *("baselines", "body", "correspondence", "fields", "kinematics", "losses", "motion"),
+    *("report", "sampling", "training"),
+)
 _MAPS = 20_000  # of the 65,530 that Linux grants; a thousand programs need about as many
 
 
+@pytest.hookimpl(tryfirst=True)  # the workers read the marks in this hook too
 def pytest_collection_modifyitems(items):
-    """With several workers, a file stays on one, and so do the long folders, which begin."""
+    """With several workers, a file stays on one: what it has made is made once.
+
+    So does the folder of the avatar, which takes most of a minute to learn.
+    """
 
     def place(item):
         folder = item.path.parent.name
-        return _TOGETHER.index(folder) if folder in _TOGETHER else len(_TOGETHER)
+        return _FIRST.index(folder) if folder in _FIRST else len(_FIRST)
 
     items.sort(key=place)
     for item in items:
-        together = item.path.parent if item.path.parent.name in _TOGETHER else item.path
-        item.add_marker(pytest.mark.xdist_group(str(together)))
+        folder = item.path.parent
+        group = folder if folder.name == "avatar" else item.path
+        item.add_marker(pytest.mark.xdist_group(str(group)))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,6 +45,15 @@ def free_programs():
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") > _MAPS:
         jax.clear_caches()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compilation(request):
+    """Programs that run for milliseconds are compiled without much optimisation."""
+    short = request.path.parent.name in _SHORT_RUNS
+    jax.config.update("jax_disable_most_optimizations", short)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import xavatar_jax as xa
 from xavatar_jax.avatar import Fit
 from xavatar_jax.fields import GridSpacing
 from xavatar_jax.frames import frames_from_params
+from xavatar_jax.training import prefit
 
 
 @dataclass(frozen=True)
@@ -58,5 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SmallRun:
     train, test = random_frames(body, 8, 0), random_frames(body, 3, 1)
     config = small_config()
     cache = tmp_path_factory.mktemp("prefit")
-    fit = xa.fit(train, config, body=body, cache=cache, verbose=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prefit, "_POINTS", 60_000)  # a rough start is enough
+        fit = xa.fit(train, config, body=body, cache=cache, verbose=False)
     return SmallRun(body, train, test, config, fit)

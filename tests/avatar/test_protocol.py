@@ -37,7 +37,7 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
     events: list[str] = []
     test = read_by(run.test, events)
     capture = SimpleNamespace(body=run.body, name="case", train=run.train, test=test, notices=())
-    short = replace(run.config, steps=4, train_frames=2, report_every=2)
+    short = replace(run.config, steps=4, report_every=2)
     fit, evaluate = xa.fit, xa.evaluate
 
     def noted_fit(frames, config, **options):
@@ -65,7 +65,7 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
     assert any(event.startswith("read") for event in events[2:])
     record = json.loads((tmp_path / "metrics.json").read_text())
     assert record["training"]["steps_done"] == 4
-    assert record["training"]["frames"] == 2
+    assert record["training"]["frames"] == 8
     assert record["by_pose_distance"]["near"]["frames"] == 1
     assert record["per_frame"][0]["pose_distance_deg"] > 1
     for name in ("checkpoint.npz", "log.jsonl", "losses.png"):

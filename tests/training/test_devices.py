@@ -66,6 +66,7 @@ def on_four_devices(*arguments: object) -> dict:
         **os.environ,
         "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
         "JAX_PLATFORMS": "cpu",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         "PYTHONPATH": os.pathsep.join([str(here), str(Path(xa.__file__).parents[1])]),
     }
     done = subprocess.run(

@@ -88,7 +88,7 @@ def test_batches_take_only_points_with_roots(case):
 
 @pytest.fixture(scope="module")
 def trained(case):
-    """A run, and how often each objective was traced in it and in a second one."""
+    """A run, and how often each objective was traced in it and in a second, shorter one."""
     body, _, config, fields, pool = case
     traces = {"geometry": 0, "skinning": 0}
 
@@ -106,7 +106,8 @@ def trained(case):
             patch.setattr(step_module, attribute, counted(name, getattr(step_module, attribute)))
         done = train_pool(body, fields, pool, np.zeros(10), config, verbose=False)
         first = dict(traces)
-        train_pool(body, fields, pool, np.ones(10), config, verbose=False)
+        shorter = replace(config, steps=config.steps - 3, report_every=1)
+        train_pool(body, fields, pool, np.ones(10), shorter, verbose=False)
     return done, first, traces
 
 

@@ -18,7 +18,6 @@ from ..training import (
     config_from_dict,
     config_to_dict,
     fresh_fields,
-    settle_on_person,
     trainable_filter,
 )
 from .avatar import Avatar
@@ -78,7 +77,7 @@ def load_avatar(
     config = config_from_dict(header["config"])
     betas = arrays.pop("betas")
     if fields is None:
-        fields = settle_on_person(body, fresh_fields(body, config), betas, config)
+        fields = fresh_fields(body, config, betas)
     avatar = Avatar(body, betas, fields, config, header["steps"])
     kept = unflatten_named(_kept(fields, avatar), arrays, source=os.fspath(path))
     return Avatar(body, betas, eqx.combine(kept, fields), config, header["steps"])

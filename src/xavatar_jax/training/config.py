@@ -209,6 +209,22 @@ def paper() -> FitConfig:
     )
 
 
+def for_programs(config: FitConfig) -> FitConfig:
+    """The config with everything at its default that is read between steps alone.
+
+    Runs that differ in nothing else share their compiled programs.
+    """
+    return FitConfig(
+        seed=config.seed,
+        frames_per_step=config.frames_per_step,
+        skinning=config.skinning,
+        geometry=config.geometry,
+        search=config.search,
+        losses=config.losses,
+        optimiser=config.optimiser,
+    )
+
+
 PRESETS = {"quick": quick, "paper": paper}
 """Presets by name: functions that give a `FitConfig`."""
 

@@ -37,14 +37,22 @@ class AvatarFields(eqx.Module):
     geometry: AbstractGeometryField
 
 
-def fresh_fields(body: BodyModel, config: FitConfig) -> AvatarFields:
-    """Fields before anything was fitted: a function of body, config and seed."""
+def fresh_fields(
+    body: BodyModel, config: FitConfig, betas: Float[np.ndarray, " S"] | None = None
+) -> AvatarFields:
+    """Fields before anything was fitted: a function of body, config and seed.
+
+    They know the mean shape alone; with `betas`, as `settle_on_person` leaves them.
+    """
     key_skinning, key_geometry = _keys(config)
     if config.skinning.kind == "mlp":
         skinning = MLPSkinning(body.tree, config.skinning.mlp, key=key_skinning)
-    else:
+    elif betas is None or not _moves_grids(config):
         skinning = _grids(body, mean_canonical_vertices(body), config.skinning, key_skinning)
-    return AvatarFields(skinning, _geometry(body, config.geometry, key_geometry))
+    else:
+        skinning = _person_grids(body, betas, config)
+    geometry = _geometry(body, config.geometry, key_geometry)
+    return AvatarFields(skinning, geometry if betas is None else _moved(geometry, body, betas))
 
 
 def _keys(config: FitConfig) -> Array:
@@ -59,6 +67,23 @@ def _grids(
     if config.start == "random":
         return random_grid_skinning(body, vertices, config.grid, config.correction, key=key)
     return template_grid_skinning(body, vertices, config.grid, config.correction)
+
+
+def _person_grids(body: BodyModel, betas: Any, config: FitConfig) -> GridSkinning:
+    vertices = canonical_vertices(body, jnp.asarray(betas, body.template.dtype))
+    return _grids(body, np.asarray(vertices, np.float64), config.skinning, _keys(config)[0])
+
+
+def _moves_grids(config: FitConfig) -> bool:
+    return config.losses.surface > 0 or config.skinning.start == "random"
+
+
+def _moved(geometry: AbstractGeometryField, body: BodyModel, betas: Any) -> AbstractGeometryField:
+    """A field whose condition is heard around the person's own joints."""
+    if not isinstance(geometry, HashGeometry):
+        return geometry
+    joints = canonical_joints(body, jnp.asarray(betas, body.template.dtype))
+    return eqx.tree_at(lambda g: g.joints, geometry, jnp.asarray(joints, jnp.float32))
 
 
 def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGeometryField:
@@ -116,16 +141,10 @@ def settle_on_person(
     weights where that term is off (ablation A4). Grids that start at random are only moved to the
     person, and know no weights of the template.
     """
-    shape = jnp.asarray(betas, body.template.dtype)
-    asked = config.losses.surface > 0 or config.skinning.start == "random"
-    if isinstance(fields.skinning, GridSkinning) and asked:
-        vertices = np.asarray(canonical_vertices(body, shape), np.float64)
-        grid = _grids(body, vertices, config.skinning, _keys(config)[0])
-        fields = eqx.tree_at(lambda f: f.skinning, fields, grid)
-    if isinstance(fields.geometry, HashGeometry):
-        joints = jnp.asarray(canonical_joints(body, shape), jnp.float32)
-        fields = eqx.tree_at(lambda f: f.geometry.joints, fields, joints)
-    return fields
+    skinning = fields.skinning
+    if isinstance(skinning, GridSkinning) and _moves_grids(config):
+        skinning = _person_grids(body, betas, config)
+    return AvatarFields(skinning, _moved(fields.geometry, body, betas))
 
 
 def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:

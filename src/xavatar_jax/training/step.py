@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .batch import Batch
-from .config import FitConfig
+from .config import FitConfig, for_programs
 from .devices import ONE_DEVICE, Devices
 from .model import AvatarFields, trainable_filter
 from .objective import (
@@ -154,10 +154,11 @@ def make_steps(
     fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
     optimisers: dict[str, Any] = {}
     steps: dict[str, Step] = {}
+    read = for_programs(config)
 
     def bind(plan: _Plan) -> Step:
         return lambda state, pool: _step(
-            (pool, anchors, fixed_arrays, dict(terms or {})), state, static, plan, config, devices
+            (pool, anchors, fixed_arrays, dict(terms or {})), state, static, plan, read, devices
         )
 
     for plan in _plans(pool, config, held):

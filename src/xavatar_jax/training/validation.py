@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..frames import Frames, spread
-from .config import FitConfig, ValidationConfig
+from .config import FitConfig, ValidationConfig, for_programs
 from .model import AvatarFields
 from .objective import Anchors, full_objective, skinning_objective
 from .pool import FramePool
@@ -51,7 +51,8 @@ def make_validation(
     """
     count = min(config.validation.points, pool.points.shape[1])
     several = rows_with_several(pool, count) if config.search.cached else 0
-    return lambda fields, pool: _loss(fields, pool, anchors, config, held, count, several)
+    read = for_programs(config)
+    return lambda fields, pool: _loss(fields, pool, anchors, read, held, count, several)
 
 
 @eqx.filter_jit
