@@ -30,38 +30,47 @@ from xavatar_jax.training.devices import share_work
 from xavatar_jax.training.loop import train_pool
 from xavatar_jax.training.pool import FramePool
 
-preset, frames_per_step, held, file = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
-config = tiny({"quick": xa.quick, "paper": xa.paper}[preset]())
-config = replace(
-    config, steps=6, report_every=1, polish_every=3, frames_per_step=frames_per_step,
-    points_per_step=32, skinning_points=16,
-    geometry=replace(config.geometry, mlp=MLPShape(width=48), log2_size=10),
-    search=replace(config.search, keep=2, max_steps=8),
-    validation=replace(config.validation, every=6, points=32),
-)
 body = xa.synthetic_body()
-arrays, _ = load_arrays(file)
+arrays, _ = load_arrays(sys.argv[1])
 params = jax.tree.map(jnp.asarray, posed_frames(body, 3).params)
 pool = FramePool(params=params, **{name: jnp.asarray(value) for name, value in arrays.items()})
-fields = fresh_fields(body, config)
-result = {}
-for count in (1, 4):
-    devices = share_work(config, jax.devices()[:count])
-    done = train_pool(
-        body, fields, pool, np.zeros(10), config, held=held, verbose=False, devices=devices
+
+def run(preset, frames_per_step, held):
+    config = tiny(preset)
+    config = replace(
+        config, steps=6, report_every=1, polish_every=3, frames_per_step=frames_per_step,
+        points_per_step=32, skinning_points=16,
+        geometry=replace(config.geometry, mlp=MLPShape(width=48), log2_size=10),
+        search=replace(config.search, keep=2, max_steps=8),
+        validation=replace(config.validation, every=6, points=32),
     )
-    leaf = jax.tree.leaves(done.fields)[0]
-    result[count] = {
-        "mesh": None if devices.mesh is None else dict(devices.mesh.shape),
-        "losses": done.history.terms["loss"], "validation": done.history.validation,
-        "devices": len(leaf.devices()),
-    }
-print("RESULT", json.dumps(result))
+    fields = fresh_fields(body, config)
+    result = {}
+    for count in (1, 4):
+        devices = share_work(config, jax.devices()[:count])
+        done = train_pool(
+            body, fields, pool, np.zeros(10), config, held=held, verbose=False, devices=devices
+        )
+        leaf = jax.tree.leaves(done.fields)[0]
+        result[count] = {
+            "mesh": None if devices.mesh is None else dict(devices.mesh.shape),
+            "losses": done.history.terms["loss"], "validation": done.history.validation,
+            "devices": len(leaf.devices()),
+        }
+    return result
+
+both = {"quick": run(xa.quick(), 4, 1), "paper": run(xa.paper(), 2, 0)}
+print("RESULT", json.dumps(both))
 """
 
 
-def on_four_devices(*arguments: object) -> dict:
-    here = Path(__file__).parent
+@pytest.fixture(scope="module")
+def results(case, tmp_path_factory) -> dict:
+    """Losses of both presets in a process that sees four devices."""
+    pool, here = case[4], Path(__file__).parent
+    file = tmp_path_factory.mktemp("pool") / "pool.npz"
+    leaves = {f.name: getattr(pool, f.name) for f in fields(pool) if f.name != "params"}
+    save_arrays(file, {k: v for k, v in leaves.items() if v is not None}, {})
     environment = {
         **os.environ,
         "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
@@ -70,28 +79,20 @@ def on_four_devices(*arguments: object) -> dict:
         "PYTHONPATH": os.pathsep.join([str(here), str(Path(xa.__file__).parents[1])]),
     }
     done = subprocess.run(
-        [sys.executable, "-c", RUN, *map(str, arguments)],
-        env=environment, capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-c", RUN, str(file)], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.split("RESULT", 1)[1])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("preset", "frames", "held", "mesh"),
-    [
-        ("quick", 4, 1, {"frames": 4, "points": 1}),
-        ("paper", 2, 0, {"frames": 2, "points": 2}),
-    ],
+    ("preset", "mesh"),
+    [("quick", {"frames": 4, "points": 1}), ("paper", {"frames": 2, "points": 2})],
 )
-def test_four_devices_give_the_losses_of_one(case, tmp_path, preset, frames, held, mesh):
+def test_four_devices_give_the_losses_of_one(results, preset, mesh):
     """With stored roots, and with roots that each device searches for its own points."""
-    pool = case[4]
-    leaves = {f.name: getattr(pool, f.name) for f in fields(pool) if f.name != "params"}
-    save_arrays(tmp_path / "pool.npz", leaves, {})
-    result = on_four_devices(preset, frames, held, tmp_path / "pool.npz")
-    one, four = result["1"], result["4"]
+    one, four = results[preset]["1"], results[preset]["4"]
     assert one["mesh"] is None
     assert four["mesh"] == mesh
     assert one["devices"] == four["devices"] == 1  # what comes back is on one device
