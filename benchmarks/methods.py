@@ -73,7 +73,7 @@ class Method:
                 train_frames=3 if small else config.train_frames,
                 start=_configured(config.start, minutes, seed, small),
                 **{
-                    name: replace(stage, steps=min(stage.steps, 6) if small else STEPS)
+                    name: replace(stage, steps=min(stage.steps, 60) if small else STEPS)
                     for name, stage in stages.items()
                     if stage.steps
                 },
@@ -83,7 +83,7 @@ class Method:
 
 def _configured(config: FitConfig, minutes: float, seed: int, small: bool) -> FitConfig:
     if small:
-        return replace(config, seed=seed, steps=6, train_frames=3, prefit_steps=20)
+        return replace(config, seed=seed, steps=6, train_frames=3, prefit_steps=60)
     return replace(config, seed=seed, steps=STEPS, minutes=minutes)
 
 
