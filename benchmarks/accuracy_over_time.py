@@ -13,14 +13,13 @@ budget decides more than where a run is cut off: its frames, its schedule. The f
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from charts import log_chart
 from jaxtyping import UInt8
-from methods import METHODS, learned_steps, prepare
+from methods import METHODS, learn
 from resumable import Row, add_options, every, fill, medians, score
 
 import xavatar_jax as xa
@@ -34,15 +33,8 @@ def measure(
     name: str, minutes: float, seed: int, *, capture: Any, args: argparse.Namespace
 ) -> dict[str, Any]:
     """Figures of one run."""
-    prepare(name, capture.body, seed, small=args.quick, cache=args.cache_dir)
-    clock = time.perf_counter()
-    model = METHODS[name](capture.train, minutes, seed, small=args.quick, cache=args.cache_dir)
-    spent = time.perf_counter() - clock
-    return {
-        "fit_s": spent,
-        "steps": learned_steps(model),
-        **score(model, capture.test, args.eval_frames),
-    }
+    model, spent = learn(name, capture, minutes, seed, small=args.quick, cache=args.cache_dir)
+    return {**spent, **score(model, capture.test, args.eval_frames)}
 
 
 def picture(rows: Sequence[Row], minutes: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:

@@ -9,9 +9,12 @@ cache folder, where `prepare` puts them before.
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
+
+import jax
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import Avatar, Posable
@@ -104,6 +107,25 @@ METHODS: dict[str, Method] = {
 """By the names they have in tables. Baselines without a word are in their size for two cores."""
 
 
+def learn(
+    name: str,
+    capture: Any,
+    minutes: float,
+    seed: int,
+    *,
+    small: bool = False,
+    cache: str | None = None,
+) -> tuple[Posable, dict[str, float]]:
+    """What a method gives, with its seconds and steps; nothing is compiled when it begins."""
+    prepare(name, capture.body, seed, small=small, cache=cache)
+    jax.clear_caches()
+    clock = time.perf_counter()
+    model: Any = METHODS[name](capture.train, minutes, seed, small=small, cache=cache)
+    spent = time.perf_counter() - clock
+    steps = model.steps if isinstance(model, Avatar) else model.avatar.steps
+    return model, {"fit_s": spent, "steps": steps}
+
+
 def prepare(
     name: str, body: BodyModel, seed: int, *, small: bool = False, cache: str | None = None
 ) -> None:
@@ -118,8 +140,3 @@ def prepare(
         initial_fields(body_only(body), config, cache=cache)
     else:
         start_fields(body_only(body), config, cache=cache)
-
-
-def learned_steps(model: Any) -> int:
-    """Steps that the fields of a method's answer have seen."""
-    return model.steps if isinstance(model, Avatar) else model.avatar.steps

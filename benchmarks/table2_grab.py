@@ -19,8 +19,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-from methods import METHODS, learned_steps, prepare
+from methods import METHODS, learn
 from resumable import add_options, every, fill, score
 
 import xavatar_jax as xa
@@ -66,16 +65,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     shown = capture.test[spread(capture.test, 4)]
 
     def run(name: str, seed: int) -> dict[str, Any]:
-        prepare(name, capture.body, seed, small=args.quick, cache=args.cache_dir)
-        jax.clear_caches()
-        clock = time.perf_counter()
-        model = METHODS[name](
-            capture.train, args.minutes, seed, small=args.quick, cache=args.cache_dir
+        model, spent = learn(
+            name, capture, args.minutes, seed, small=args.quick, cache=args.cache_dir
         )
-        spent = time.perf_counter() - clock
         return {
-            "fit_s": spent,
-            "steps": learned_steps(model),
+            **spent,
             "mesh_ms": measure_speed(model, shown),
             **score(model, capture.test, eval_frames),
         }

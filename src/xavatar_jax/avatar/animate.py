@@ -14,7 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..body import BodyModel, BodyParams, bone_transforms, canonical_params, check_params
+from ..body import (
+    BodyModel,
+    BodyParams,
+    bone_transforms,
+    canonical_params,
+    check_params,
+    with_betas,
+)
 from ..export import SequenceFormat, write_sequence
 from ..fields import AbstractFixedPoints
 from ..geometry import closest_points
@@ -258,9 +265,7 @@ def own_batch(avatar: Avatar, params: BodyParams, source: str) -> BodyParams:
             "least one frame"
         )
     check_params(avatar.body, params, what=source)
-    betas = jnp.asarray(avatar.betas, params.pose.dtype)
-    shape = jnp.broadcast_to(betas, (len(params), len(betas)))
-    return eqx.tree_at(lambda p: p.betas, params, shape)
+    return with_betas(params, avatar.betas)
 
 
 def spread_frames(count: int, wanted: int) -> Int[np.ndarray, " n"]:

@@ -24,6 +24,7 @@ from ..body import (
     canonical_vertices,
     check_params,
     pose_body,
+    with_betas,
 )
 from ..correspondence import RowFinder, StartSet
 from ..fields import TabulatedSkinning
@@ -32,7 +33,16 @@ from ..meshing import Mesh, extract_surface
 from ..training import AvatarFields, FitConfig
 from ..training.pool import tabulate_for_search
 from .animate import Animation, MotionLike, Offsets, PosableBase, animate, posable_base
-from .pointwise import batch_size, gradients, in_batches, logits, project, skin, skin_weights
+from .pointwise import (
+    batch_size,
+    gradients,
+    in_batches,
+    logits,
+    padded_size,
+    project,
+    skin,
+    skin_weights,
+)
 from .query import Query, query_posed
 from .rigging import GlbExport, Motions, export_glb, export_weights
 
@@ -86,10 +96,15 @@ class Avatar:
     def _query(
         self, points: Array, params: BodyParams, finder: RowFinder, starts: StartSet = "part_aware"
     ) -> Query:
+        count = len(points)
+        if count:
+            # Sizes of a few kinds only: a search compiles for seconds.
+            points = jnp.pad(points, ((0, padded_size(count) - count), (0, 0)), mode="edge")
         rows = jnp.asarray(finder(np.asarray(jax.lax.stop_gradient(points))))
-        return query_posed(
+        answer = query_posed(
             self.fields, self._table, self.body, points, rows, self._own(params), starts
         )
+        return Query(*(leaf[:count] for leaf in answer))
 
     def _row_finder(self, template: Float[np.ndarray, "V 3"]) -> RowFinder:
         return RowFinder(template, np.asarray(self.body.part_labels))
@@ -253,8 +268,7 @@ class Avatar:
 
     def _own(self, params: BodyParams) -> BodyParams:
         """Parameters with the avatar's shape in place of theirs: fields know one skeleton."""
-        betas = jnp.asarray(self.betas, params.pose.dtype)
-        return eqx.tree_at(lambda p: p.betas, params, betas)
+        return with_betas(params, self.betas)
 
     def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
         """Vertices of the body itself in this pose and the avatar's shape, metres."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..body import BodyModel
-from ..frames import Frames
+from ..frames import Frames, known_body
 from ..training import (
     AvatarFields,
     Callback,
@@ -87,11 +87,7 @@ def fit(
     **Warns:** `TrainingNotice` naming frames whose mesh and parameters do not fit.
     """
     config = quick() if config is None else config
-    body = frames.body if body is None else body
-    if body is None:
-        raise ValueError(
-            "these frames do not say which body they are for: pass body=load_body(...)"
-        )
+    body = known_body(frames, body)
     betas = subject_betas(frames)
 
     def finished(fitted: Fitted) -> Fit:

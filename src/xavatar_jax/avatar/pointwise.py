@@ -54,6 +54,11 @@ def skin(fields: AvatarFields, points: Array, transforms: Array) -> Array:
     return jax.vmap(lambda x: skin_points(x, fields.skinning(x), transforms))(points)
 
 
+def padded_size(count: int) -> int:
+    """The next power of two, 256 at least: so many points as to fill one of few sizes."""
+    return max(256, 1 << (count - 1).bit_length())
+
+
 def in_batches(function: Any, points: np.ndarray, batch: int) -> np.ndarray:
     """Apply a jitted function to fixed-size batches, the last one padded: no retracing."""
     count = len(points)

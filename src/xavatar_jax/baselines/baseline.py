@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..avatar import Avatar
-from ..body import BodyModel, BodyParams
+from ..body import BodyModel, BodyParams, with_betas
 from ..frames import Frames, posed_vertices
 from ..meshing import Mesh
 from ..training import History
@@ -38,8 +36,7 @@ class Baseline:
 
     def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
         """Vertices of the whole body in this pose and the person's shape, metres."""
-        betas = jnp.asarray(self.avatar.betas, params.pose.dtype)
-        own = eqx.tree_at(lambda p: p.betas, params, betas)
+        own = with_betas(params, self.avatar.betas)
         return np.asarray(posed_vertices(self.body, own), np.float64)
 
 
@@ -47,16 +44,3 @@ def check_minutes(minutes: float | None) -> None:
     """**Raises:** `ValueError` for a budget that is not a positive number of minutes."""
     if minutes is not None and not (np.isfinite(minutes) and minutes > 0):
         raise ValueError(f"minutes must be a positive number, found {minutes}")
-
-
-def known_body(frames: Frames, body: BodyModel | None) -> BodyModel:
-    """The body given, or else that of the frames.
-
-    **Raises:** `ValueError` if neither is there.
-    """
-    body = frames.body if body is None else body
-    if body is None:
-        raise ValueError(
-            "these frames do not say which body they are for: pass body=load_body(...)"
-        )
-    return body

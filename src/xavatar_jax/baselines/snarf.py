@@ -8,10 +8,10 @@ from dataclasses import replace
 from ..avatar import fit
 from ..body import BodyModel
 from ..fields import MLPShape
-from ..frames import Frames
+from ..frames import Frames, known_body
 from ..sampling import SamplingPlan
 from ..training import FitConfig, paper, quick
-from .baseline import Baseline, check_minutes, known_body
+from .baseline import Baseline, check_minutes
 from .skeleton import body_only, body_only_frames
 
 

@@ -28,6 +28,7 @@ from .model import rest_vertices as rest_vertices
 from .model import with_template as with_template
 from .params import BodyParams as BodyParams
 from .params import check_params as check_params
+from .params import with_betas as with_betas
 from .parts import BODY as BODY
 from .parts import EYES_MOUTH as EYES_MOUTH
 from .parts import FACE as FACE

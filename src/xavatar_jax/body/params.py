@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..kinematics import KinematicTree
 from .joints import pose_groups
@@ -193,6 +194,13 @@ def check_params(body: Any, params: BodyParams, *, what: str = "params") -> None
                 f"{what}.{name}{frame} is not finite (entry {tuple(int(i) for i in where)}): "
                 "remove or mend that frame"
             )
+
+
+def with_betas(params: BodyParams, betas: ArrayLike) -> BodyParams:
+    """The same parameters with one shape `(S,)` for all of them in place of theirs."""
+    shape = jnp.asarray(betas, params.pose.dtype)
+    shapes = jnp.broadcast_to(shape, (*params.pose.shape[:-2], len(shape)))
+    return eqx.tree_at(lambda p: p.betas, params, shapes)
 
 
 def _joints(name: str, value: Any, count: int) -> Array:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -211,7 +212,7 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         offset=jnp.asarray(offsets, jnp.int32),
         blend_nodes=jnp.asarray(margins.nodes, jnp.int32),
         blend_cells=jnp.asarray(margins.cells, jnp.int32),
-        blend_lerp=jnp.asarray(margins.lerp, jnp.float32),
+        blend_lerp=margins.lerp,
         blend_share=jnp.asarray(margins.share, jnp.float32),
     )
 
@@ -237,7 +238,7 @@ class _Margins(NamedTuple):
 
     nodes: Int[np.ndarray, " B"]
     cells: Int[np.ndarray, "B 8"]
-    lerp: Float[np.ndarray, "B 8"]
+    lerp: Float[Array, "B 8"]
     share: Float[np.ndarray, " B"]
 
 
@@ -265,6 +266,8 @@ def _margins(
     u = (np.concatenate(places) - origin) / step
     cell = np.clip(np.floor(u + 1e-6).astype(int), 0, shape - 1)
     flat = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
-    fraction = np.clip(u - cell, 0, 1)[:, None, :]
-    lerp = np.where(CORNERS == 1, fraction, 1 - fraction).prod(-1)
+    lerp = _lerp_weights(jnp.asarray(np.clip(u - cell, 0, 1), jnp.float32))
     return _Margins(np.concatenate(picked), cells[index[flat]], lerp, np.concatenate(shares))
+
+
+_lerp_weights = jax.jit(lerp_weights)

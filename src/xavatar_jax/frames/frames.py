@@ -296,3 +296,16 @@ def _as_vertices_and_faces(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
         f"Not a mesh: {type(mesh).__name__}. Give (vertices, faces), an object with `vertices` "
         "and `faces`, or a path."
     )
+
+
+def known_body(frames: Frames, body: BodyModel | None) -> BodyModel:
+    """The body given, or else that of the frames.
+
+    **Raises:** `ValueError` if neither is there.
+    """
+    body = frames.body if body is None else body
+    if body is None:
+        raise ValueError(
+            "these frames do not say which body they are for: pass body=load_body(...)"
+        )
+    return body

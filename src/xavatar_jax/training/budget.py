@@ -6,6 +6,7 @@ import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import jax
 
@@ -19,7 +20,18 @@ _TIMED_SHARE = 0.05  # of what is left: where steps are slow, fewer are timed
 _MARGIN = 0.95  # polishing and checkpoints come out of the rest
 
 
-def frames_in_budget(config: FitConfig) -> int:
+class Budget(Protocol):
+    """What a config says of frames and time: see `FitConfig`."""
+
+    @property
+    def minutes(self) -> float | None: ...
+    @property
+    def train_frames(self) -> int: ...
+    @property
+    def frames_per_minute(self) -> int: ...
+
+
+def frames_in_budget(config: Budget) -> int:
     """How many frames to learn from (0: all): `train_frames`, or what `minutes` can label.
 
     Told by the config alone, so that no draw depends on a clock.
@@ -30,7 +42,9 @@ def frames_in_budget(config: FitConfig) -> int:
     return min(config.train_frames, most) if config.train_frames else most
 
 
-def say_fewer_frames(config: FitConfig, learned: int, wanted: int, record: list[str]) -> None:
+def say_fewer_frames(
+    config: FitConfig, learned: int, wanted: int, record: list[str] | None
+) -> None:
     """Say (see `notify`) if the budget left frames out."""
     if learned < wanted:
         notify(

@@ -21,10 +21,11 @@ class TrainingNotice(UserWarning):
     """Something about a training run was assumed, or looks wrong."""
 
 
-def notify(message: str, record: list[str], *, stacklevel: int) -> None:
-    """Warn (`TrainingNotice`), and add the message to the run's record."""
+def notify(message: str, record: list[str] | None, *, stacklevel: int) -> None:
+    """Warn (`TrainingNotice`), and add the message to the run's record, if there is one."""
     warnings.warn(message, TrainingNotice, stacklevel=stacklevel + 1)
-    record.append(message)
+    if record is not None:
+        record.append(message)
 
 
 @dataclass
@@ -45,7 +46,7 @@ class FrameCheck:
         if frame.turned:
             self.turned.append(frame.source)
 
-    def notify(self, record: list[str]) -> None:
+    def notify(self, record: list[str] | None) -> None:
         """Say (see `notify`) which frames do not fit, and which meshes were turned round."""
         if self.misfits:
             worst = sorted(self.misfits, key=lambda entry: -entry[1])

@@ -181,7 +181,7 @@ def load_checkpoint(
         notify(
             f"{name}: written with {', '.join(other)}. The run goes on, but its numbers may "
             "differ in their last digits from those of an uninterrupted one.",
-            [] if notices is None else notices,
+            notices,
             stacklevel=3,
         )
     return Checkpoint(name, arrays, header)

@@ -88,19 +88,11 @@ class Devices:
 
     def agree(self, flag: bool) -> bool:
         """Whether the flag is up in any process; every process has to ask."""
-        if jax.process_count() == 1:
-            return flag
-        from jax.experimental.multihost_utils import process_allgather
-
-        return bool(np.any(process_allgather(np.asarray(flag))))
+        return bool(np.any(_of_every_process(flag)))
 
     def least(self, number: int) -> int:
         """The least of the numbers of all processes; every process has to ask."""
-        if jax.process_count() == 1:
-            return number
-        from jax.experimental.multihost_utils import process_allgather
-
-        return int(np.min(process_allgather(np.asarray(number))))
+        return int(np.min(_of_every_process(number)))
 
     @property
     def count(self) -> int:
@@ -108,6 +100,15 @@ class Devices:
 
 
 ONE_DEVICE = Devices()
+
+
+def _of_every_process(value: Any) -> np.ndarray:
+    """The values of all processes, each of which has to ask."""
+    if jax.process_count() == 1:
+        return np.asarray(value)
+    from jax.experimental.multihost_utils import process_allgather
+
+    return np.asarray(process_allgather(np.asarray(value)))
 
 
 def _specs(batch: Batch) -> Batch:

@@ -145,7 +145,7 @@ def choose_frames(
     rows, held = split_validation(frames, config.validation)
     count = min(frames_in_budget(config) or len(rows), len(rows))
     wanted = min(config.train_frames or len(rows), len(rows))
-    say_fewer_frames(config, count, wanted, [] if notices is None else notices)
+    say_fewer_frames(config, count, wanted, notices)
     return rows[varied_frames(frames.params[rows], count)], held
 
 

@@ -89,7 +89,7 @@ def label_frames(
         check.look(frame)
         drawn.append(draw_points(body, frame, config, place=k))
         bar.update(1)
-    check.notify([] if notices is None else notices)
+    check.notify(notices)
     return pool_of(body, drawn, frames.params)
 
 

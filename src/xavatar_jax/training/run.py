@@ -103,7 +103,6 @@ class Run:
             if self.config.minutes is None or self.config.minutes != saved.minutes:
                 history.planned = 0
             self.best = replace(self.best, learned=devices.replicate(self.best.learned))
-        self.total = min(history.planned or self.config.steps, self.config.steps)
         state = eqx.tree_at(lambda s: s.total, state, jnp.asarray(self.total, jnp.int32))
         self.pace = None
         if deadline is not None and not history.planned and config.optimiser.schedule == "cosine":
@@ -115,6 +114,11 @@ class Run:
         if redraw is not None:
             redraw.begin(self.at)
         self._write({"event": "start" if saved is None else "resume", **self._head()})
+
+    @property
+    def total(self) -> int:
+        """Steps that there will be, if nothing ends the run before."""
+        return min(self.history.planned or self.config.steps, self.config.steps)
 
     def to_the_end(self, *, verbose: bool) -> Fitted:
         """Steps until there are enough, time is up, nothing is gained, or somebody stops it."""
@@ -227,7 +231,7 @@ class Run:
         self._settle()
         extra = self.validation_s / self.config.validation.every
         most = self.at + self.devices.least(pace.steps_left(extra))
-        self.total = self.history.planned = min(most, self.config.steps)
+        self.history.planned = min(most, self.config.steps)
         total = self.devices.replicate(jnp.asarray(self.total, jnp.int32))
         self.state = eqx.tree_at(lambda s: s.total, self.state, total)
         self.pace = None

@@ -59,8 +59,12 @@ def falling(config: FitConfig, step: Int[Array, ""], total: Int[Array, ""]) -> F
     """
     if config.optimiser.schedule == "constant":
         return jnp.ones(())
-    share = jnp.minimum(step / jnp.maximum(total, 1).astype(jnp.float32), 1)
-    return 0.01 + 0.99 * 0.5 * (1 + jnp.cos(jnp.pi * share))
+    return cosine(step / jnp.maximum(total, 1).astype(jnp.float32))
+
+
+def cosine(share: Float[Array, ""]) -> Float[Array, ""]:
+    """What is left of a rate that falls to a hundredth, when a share of the way is over."""
+    return jnp.asarray(optax.cosine_decay_schedule(1.0, 1, alpha=0.01)(share))
 
 
 def draw_batch(

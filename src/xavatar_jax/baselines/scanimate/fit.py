@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ...avatar import Avatar
 from ...body import BodyModel, canonical_vertices
 from ...fields import AbstractSkinningField
-from ...frames import Frames
+from ...frames import Frames, known_body
 from ...sampling import varied_frames
 from ...training import (
     AvatarFields,
@@ -30,8 +30,10 @@ from ...training import (
     subject_betas,
     trainable_filter,
 )
+from ...training.budget import frames_in_budget
 from ...training.progress import progress
-from ..baseline import Baseline, check_minutes, known_body
+from ...training.step import cosine
+from ..baseline import Baseline, check_minutes
 from ..skeleton import body_only, body_only_frames
 from .config import ScanimateConfig, Stage, scanimate_quick
 from .fields import InverseSkinning, LocalPoseMLP, SoftmaxSkinning
@@ -47,7 +49,6 @@ from .objective import (
 from .scans import Scans, edge_stretch, read_scans
 
 _REPORT_EVERY = 25
-_LEAST_FRAMES = 24
 
 
 def fit_scanimate(
@@ -71,7 +72,7 @@ def fit_scanimate(
     started = time.perf_counter()
     whole = known_body(frames, body)
     cut = body_only(whole)
-    count = _frames_in_budget(config, len(frames))
+    count = min(frames_in_budget(config) or len(frames), len(frames))
     learned_from = body_only_frames(cut, frames[varied_frames(frames.params, count)])
     betas = subject_betas(frames)
     history = History()
@@ -116,14 +117,6 @@ def fit_scanimate(
     learned = AvatarFields(nets.forward, geometry)
     avatar = Avatar(cut, betas, learned, config.start, history.steps_done)
     return Baseline(whole, avatar, history, learned_from)
-
-
-def _frames_in_budget(config: ScanimateConfig, most: int) -> int:
-    """How many frames to learn from. Told by the config alone: no draw depends on a clock."""
-    count = config.train_frames or most
-    if config.minutes is not None and config.frames_per_minute:
-        count = min(count, max(round(config.minutes * config.frames_per_minute), _LEAST_FRAMES))
-    return min(count, most)
 
 
 def start_fields(
@@ -295,7 +288,7 @@ def _step(
 def learning_rate(stage: Stage, done: Float[Array, ""]) -> Float[Array, ""]:
     """The rate when a share of the stage's steps or time is over."""
     if stage.schedule == "cosine":
-        return stage.rate * (0.01 + 0.99 * 0.5 * (1 + jnp.cos(jnp.pi * done)))
+        return stage.rate * cosine(done)
     return stage.rate * 0.1 ** ((done >= 0.5).astype(float) + (done >= 0.75))
 
 

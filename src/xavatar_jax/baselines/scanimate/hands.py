@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ...body import BodyModel, BodyParams, canonical_pose, pose_body
+from ...geometry import face_areas
 from ...kinematics import KinematicTree
 from ..skeleton import body_only
 
@@ -38,7 +39,6 @@ def static_hands(
         fingers = [j for j in whole.tree.subtree(wrist) if j != wrist]
         pose[fingers] = np.asarray(params.pose).mean(0)[fingers]
     own = BodyParams.create(whole, pose=pose, betas=betas)
-    corners = np.asarray(pose_body(whole, own).vertices, np.float64)[faces[on_hand]]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
-    return corners, area / area.sum()
+    vertices = np.asarray(pose_body(whole, own).vertices, np.float64)
+    area = face_areas(vertices, faces[on_hand])
+    return vertices[faces[on_hand]], area / area.sum()

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...body import BodyModel, BodyParams, bone_transforms, pose_body
+from ...body import BodyModel, BodyParams, bone_transforms, pose_body, with_betas
 from ...fields import template_weights
 from ...frames import Frames
 from ...geometry import closest_points, face_normals, sample_surface, vertex_normals
@@ -37,9 +37,7 @@ def read_scans(
     body: BodyModel, frames: Frames, betas: Any, config: ScanimateConfig, *, bar: Any
 ) -> Scans:
     """Draw `config.triangles` triangles of each frame by area, keyed by seed and place."""
-    shape = jnp.asarray(betas, frames.params.pose.dtype)
-    shapes = jnp.broadcast_to(shape, (len(frames), len(shape)))
-    params = eqx.tree_at(lambda p: p.betas, frames.params, shapes)
+    params = with_betas(frames.params, betas)
     all_corners, all_known, all_transforms = [], [], []
     for k in range(len(frames)):
         frame = frames[k]
