@@ -51,7 +51,8 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
         return evaluate(run.fit.avatar, frames, **{**options, "num_frames": 1})
 
     monkeypatch.setattr(loop, "initial_fields", lambda *_, **__: run.fit.before.fields)
-    monkeypatch.setattr(loop, "settle_on_person", lambda *_: run.fit.before.fields)
+    # With the grid of the person, whose programs are compiled.
+    monkeypatch.setattr(loop, "settle_on_person", lambda *_: run.fit.avatar.fields)
     monkeypatch.setattr(xa, "fit", noted_fit)
     monkeypatch.setattr(xa, "evaluate", quick_evaluate)
     monkeypatch.setattr(command, "load", lambda options: capture)

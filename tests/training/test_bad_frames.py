@@ -135,6 +135,7 @@ def test_notices_are_kept_with_the_run(case, no_prefit, tmp_path):
     moved = np.array([0.2, 0, 0])
     wrong = with_meshes(frames, lambda k, v, f: (v + moved * (k == 1), f[:, ::-1] if k else f))
     kept = {"checkpoint": tmp_path / "run.npz", "body": body, "verbose": False}
+    config = replace(config, steps=1)  # all is said before it
     with pytest.warns(TrainingNotice) as said:
         done = xa.fit(wrong, config, **kept)
     messages = [str(w.message) for w in said]

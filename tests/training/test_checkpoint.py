@@ -41,7 +41,7 @@ def job(case, no_prefit):
     """A call of `fit` on 12 frames, judged by one, whose points are drawn and searched once."""
     body, _, config, fields, _ = case
     config = replace(
-        config, report_every=2, polish_every=5, checkpoint_every=4,
+        config, train_frames=2, report_every=2, polish_every=5, checkpoint_every=4,
         validation=replace(config.validation, every=3, points=128),
     )  # fmt: skip
     frames = posed_frames(body, 12)
@@ -221,12 +221,14 @@ def test_a_loss_that_is_not_finite_keeps_the_last_good_state(job, whole, tmp_pat
     assert error.value.fitted.history.stopped == "not finite"
     arrays, header = load_arrays(path)
     assert header["step"] == 6
-    good = flatten_named(whole[2][6])
+    before, good, after = (flatten_named(whole[2][k]) for k in (2, 6, 10))
     kept = {n.removeprefix("state:learned."): v for n, v in arrays.items() if ":learned." in n}
     assert len(kept) > 4
     for name, value in kept.items():
-        # Another program, with one more addition in it: its roundings may differ.
-        np.testing.assert_allclose(value, good[name], rtol=1e-4, atol=1e-6, err_msg=name)
+        # Another program, with one more addition in it, rounds in another way: what it has learned
+        # differs by less than a hundredth of what four steps change.
+        steps = [np.abs(good[name] - other[name]).max() for other in (before, after)]
+        assert np.abs(value - good[name]).max() <= 0.01 * min(steps), name
 
 
 def test_an_infinite_gradient_of_a_finite_loss_is_named(case, other_objective):

@@ -40,7 +40,7 @@ def run(preset, frames_per_step, held):
     config = replace(
         config, steps=6, report_every=1, polish_every=3, frames_per_step=frames_per_step,
         points_per_step=32, skinning_points=16,
-        geometry=replace(config.geometry, mlp=MLPShape(width=48), log2_size=10),
+        geometry=replace(config.geometry, mlp=MLPShape(width=48, depth=3, skip=()), log2_size=10),
         search=replace(config.search, keep=2, max_steps=8),
         validation=replace(config.validation, every=6, points=32),
     )
@@ -73,7 +73,7 @@ def results(case, tmp_path_factory) -> dict:
     save_arrays(file, {k: v for k, v in leaves.items() if v is not None}, {})
     environment = {
         **os.environ,
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4",
         "JAX_PLATFORMS": "cpu",
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         "PYTHONPATH": os.pathsep.join([str(here), str(Path(xa.__file__).parents[1])]),
