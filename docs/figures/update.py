@@ -5,6 +5,7 @@
     python docs/figures/update.py --part-aware part_aware.json
     python docs/figures/update.py --animate animate.json
     python docs/figures/update.py --correspondence search.json --gradients gradients.json
+    python docs/figures/update.py --table1 table1.json --table2 table2.json --curve curve.json
 
 A result is copied into this folder without what is of no use elsewhere (paths, single frames).
 A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`; the table
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
 from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path
@@ -35,6 +37,7 @@ ANIMATE = "animate.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
 FLOOR = "metric_floor.json"
 MEMORY = "memory.json"
+TABLE1, TABLE2, CURVE = "table1_ablations.json", "table2_grab.json", "accuracy_over_time.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
 
@@ -348,6 +351,59 @@ def memory_view(record: dict[str, Any]) -> str:
     return f"{_table(rows)}\n\n{_machine(header)}; preset `quick`, {header['steps']} steps."
 
 
+_RUN_COLUMNS = (
+    ("cd_all_mm", "Chamfer, all, mm", 2),
+    ("cd_hands_mm", "hands", 2),
+    ("cd_face_mm", "face", 2),
+)
+_ABLATION_COLUMNS = (
+    *_RUN_COLUMNS,
+    ("steps", "steps", 0),
+    ("step_ms", "a step, ms", 0),
+    ("search_share", "search's share", 2),
+    ("seeds", "seeds", 0),
+)
+_METHOD_COLUMNS = (
+    *_RUN_COLUMNS,
+    ("cd_max_all_mm", "maximum, all, mm", 1),
+    ("cd_max_hands_mm", "hands", 1),
+    ("nc_all", "normal consistency", 3),
+    ("iou_all", "IoU", 3),
+    ("steps", "steps", 0),
+    ("mesh_ms", "a mesh, ms", 0),
+    ("seeds", "seeds", 0),
+)
+_CURVE_COLUMNS = (
+    ("minutes", "minutes", 1),
+    *_RUN_COLUMNS,
+    ("steps", "steps", 0),
+    ("seeds", "seeds", 0),
+)
+
+
+def medians_view(
+    by: tuple[str, ...], columns: tuple[tuple[str, str, int], ...]
+) -> Callable[[dict[str, Any]], str]:
+    """Medians over seeds, a row for each different `by`; what is a column too is no row's name."""
+    shown = [name for name in by if name not in {column for column, _, _ in columns}]
+
+    def view(record: dict[str, Any]) -> str:
+        sys.path.append(str(ROOT / "benchmarks"))
+        from resumable import medians
+
+        rows = [[*shown, *(label for _, label, _ in columns)]]
+        for row in medians(record["rows"], by):
+            rows.append([*(f"{row[name]}" for name in shown), *_cells(row, columns)])
+        header = record["header"]
+        budget = f", {header['minutes']:g} minutes a run" if "minutes" in header else ""
+        return (
+            f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['eval_frames']} held-out "
+            f"frames{budget}; medians over seeds."
+        )
+
+    return view
+
+
 def time_of_gradients_view(record: dict[str, Any]) -> str:
     """Roots and their derivatives by the field's parameters, milliseconds."""
     rows = [["method", "mode", "ms for 1000 points", "first call, s"]]
@@ -420,6 +476,9 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{GRADIENTS} time": time_of_gradients_view,
     f"docs/figures/{FLOOR}": floor_view,
     f"docs/figures/{MEMORY}": memory_view,
+    f"docs/figures/{TABLE1}": medians_view(("setting", "name"), _ABLATION_COLUMNS),
+    f"docs/figures/{TABLE2}": medians_view(("name",), _METHOD_COLUMNS),
+    f"docs/figures/{CURVE}": medians_view(("name", "minutes"), _CURVE_COLUMNS),
 }
 _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
@@ -470,6 +529,21 @@ def _store(source: str, name: str, slim: Callable[[dict[str, Any]], dict[str, An
     (FOLDER / name).write_text(text + "\n", encoding="utf-8")
 
 
+_STORED = {
+    "metrics": METRICS,
+    "part_aware": PART_AWARE,
+    "animate": ANIMATE,
+    "correspondence": SEARCH,
+    "gradients": GRADIENTS,
+    "metric_floor": FLOOR,
+    "memory": MEMORY,
+    "table1": TABLE1,
+    "table2": TABLE2,
+    "curve": CURVE,
+}
+"""Where the file of each option is kept."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
@@ -479,21 +553,14 @@ def main() -> None:
     parser.add_argument("--gradients", help="JSON of benchmarks/gradients.py")
     parser.add_argument("--metric-floor", help="JSON of benchmarks/metric_floor.py")
     parser.add_argument("--memory", help="JSON of benchmarks/memory.py")
+    parser.add_argument("--table1", help="JSON of benchmarks/table1_ablations.py")
+    parser.add_argument("--table2", help="JSON of benchmarks/table2_grab.py")
+    parser.add_argument("--curve", help="JSON of benchmarks/accuracy_over_time.py")
     args = parser.parse_args()
-    if args.metrics:
-        _store(args.metrics, METRICS, slim_metrics)
-    if args.part_aware:
-        _store(args.part_aware, PART_AWARE, slim_benchmark)
-    if args.animate:
-        _store(args.animate, ANIMATE, slim_benchmark)
-    if args.correspondence:
-        _store(args.correspondence, SEARCH, slim_benchmark)
-    if args.gradients:
-        _store(args.gradients, GRADIENTS, slim_benchmark)
-    if args.metric_floor:
-        _store(args.metric_floor, FLOOR, slim_benchmark)
-    if args.memory:
-        _store(args.memory, MEMORY, slim_benchmark)
+    for option, source in vars(args).items():
+        if source:
+            slim = slim_metrics if option == "metrics" else slim_benchmark
+            _store(source, _STORED[option], slim)
     for name in TEXTS:
         path = ROOT / name
         path.write_text(filled(path.read_text("utf-8")), encoding="utf-8")
