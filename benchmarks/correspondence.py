@@ -86,6 +86,7 @@ class Size:
     plain_grid: bool = True
     repeats: int = 2
     grid_mm: tuple[float, float, float] = (16, 4, 8)
+    guide_mm: tuple[float, float, float] = (8, 3, 4)
     batches: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000)
     slow_batches: tuple[int, ...] = (10_000, 30_000, 100_000)
     bones: tuple[int, ...] = (3, 9, 16, 30, 45)
@@ -107,6 +108,7 @@ QUICK = Size(
     plain_grid=False,
     repeats=1,
     grid_mm=(34, 8, 16),
+    guide_mm=(34, 8, 16),
     batches=(10_000, 40_000),
     slow_batches=(),
     bones=(),
@@ -117,7 +119,7 @@ QUICK = Size(
 
 
 class Fields(NamedTuple):
-    """The network, the same tabulated, and what that took in seconds."""
+    """The network, the same tabulated (a field, or a guide), and what that took in seconds."""
 
     mlp: AbstractSkinningField
     grid: TabulatedSkinning
@@ -194,14 +196,18 @@ def plain_row(
     problems: list[Problem],
     starts: StartSet,
     size: Size,
-) -> dict[str, Any]:
-    """The plain path, part by part, on a share of the points; it starts at bones only."""
+) -> tuple[dict[str, Any], np.ndarray]:
+    """The plain path, part by part, on a share of the points; it starts at bones only.
+
+    And which points of all problems these are.
+    """
     by_part = starts in ("paper", "part_aware")
     groups = part_groups(body.tree, starts if by_part else "paper")
     # Points of one group are searched together.
     of_part = [groups[name if by_part else starts].bones for name in PARTS]
     spent, compile_s, lanes, steps = 0.0, 0.0, 0, 0
     hit, parts, residuals = [], [], []
+    asked = np.zeros((len(problems), size.points), bool)
     for k, p in enumerate(problems):
         labels = np.asarray(p.parts)
         every = size.points // size.plain_points
@@ -210,6 +216,7 @@ def plain_row(
             rows = np.flatnonzero(np.isin(labels, own))[::every]
             if not len(rows):
                 continue
+            asked[k, rows] = True
             x_d, x_c = p.x_d[rows], np.asarray(p.x_c)[rows]
             run = lambda x=x_d, t=p.transforms, b=bones: _plain(field, x, t, b)  # noqa: E731
             if k == 0:
@@ -221,7 +228,7 @@ def plain_row(
             hit.append(hits(points, found, x_c))
             parts.append(labels[rows])
             residuals.append(np.asarray(residual)[np.asarray(found)])
-    return {
+    measured = {
         "points": len(np.concatenate(hit)) // len(problems),
         "points_per_s": len(np.concatenate(hit)) / spent,
         **recall(np.concatenate(hit), np.concatenate(parts)),
@@ -231,10 +238,18 @@ def plain_row(
         "starts_per_point": lanes / len(np.concatenate(hit)),
         "compile_s": compile_s - spent / len(problems),
     }
+    return measured, asked.reshape(-1)
 
 
-def fast_row(search: Search, problems: list[Problem], fields: Fields, path: str, repeats: int):
-    """A compiled path on whole frames."""
+def fast_row(
+    search: Search,
+    problems: list[Problem],
+    fields: Fields,
+    path: str,
+    repeats: int,
+    asked: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """A compiled path on whole frames; its recall of the points that the plain path was asked."""
     spent, lanes, steps = 0.0, 0, 0
     hit, parts, residuals, peak = [], [], [], None
     for k, p in enumerate(problems):
@@ -255,6 +270,7 @@ def fast_row(search: Search, problems: list[Problem], fields: Fields, path: str,
         "points_per_s": 1 / each,
         "points_per_s_with_tables": 1 / (each + tables),
         **recall(found, np.concatenate(parts)),
+        **({} if asked is None else {"recall_plain_points": float(found[asked].mean())}),
         "residual_max_m": float(np.concatenate(residuals).max()),
         "residual_median_m": float(np.median(np.concatenate(residuals))),
         "steps_per_start": steps / lanes,
@@ -266,7 +282,7 @@ def fast_row(search: Search, problems: list[Problem], fields: Fields, path: str,
 
 
 def paths_table(
-    body: BodyModel, vertices: np.ndarray, fields: Fields, size: Size, seed: int
+    body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
     """Paths x fields x start sets x difficulty."""
     problems = {
@@ -282,20 +298,21 @@ def paths_table(
         for name in ("mlp", "grid")
         for degrees in size.degrees
     }
-    rows = []
+    rows, asked = [], {}
     for starts in size.starts:
         table = start_table(body.tree, starts)
         for path, name in PATHS:
             if path == "plain" and name == "grid" and not size.plain_grid:
                 continue
             field, search = getattr(fields, name), None
+            tables = guides if path == "guided" else fields
             for degrees in size.degrees:
-                cases = problems[name, degrees]
+                cases, case = problems[name, degrees], (name, starts, degrees)
                 if path == "plain":
-                    measured = plain_row(body, field, cases, starts, size)
+                    measured, asked[case] = plain_row(body, field, cases, starts, size)
                 else:
-                    search = search or compiled(path, field, fields, table, cases[0])
-                    measured = fast_row(search, cases, fields, path, size.repeats)
+                    search = search or compiled(path, field, tables, table, cases[0])
+                    measured = fast_row(search, cases, tables, path, size.repeats, asked.get(case))
                 label = {"path": path, "field": name, "starts": starts, "pose_deg": degrees}
                 rows.append({"table": "paths", **label, **measured})
                 print_rows(rows[-1:], COLUMNS)
@@ -322,7 +339,7 @@ def one_frame(
 
 
 def batch_table(
-    body: BodyModel, vertices: np.ndarray, fields: Fields, size: Size, seed: int
+    body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
     """Throughput and memory against the number of points given at once."""
     table = start_table(body.tree, "part_aware")
@@ -335,11 +352,11 @@ def batch_table(
             continue
         counts = size.batches if path == "grid" or size.slow_batches else ()
         for count in size.slow_batches if path == "batched" else counts:
-            field = getattr(fields, name)
+            field, tables = getattr(fields, name), guides if path == "guided" else fields
             case = one_frame(body, vertices, field, transforms, count, seed)
-            search = compiled(path, field, fields, table, case)
+            search = compiled(path, field, tables, table, case)
             few = 1 if count >= 300_000 or path == "batched" else size.repeats
-            row = fast_row(search, [case], fields, path, few)
+            row = fast_row(search, [case], tables, path, few)
             label = {"path": path, "field": name, "starts": "part_aware", "pose_deg": 20.0}
             rows.append({"table": "batches", **label, **row})
             print_rows(rows[-1:], COLUMNS)
@@ -347,20 +364,21 @@ def batch_table(
 
 
 def bones_table(
-    body: BodyModel, vertices: np.ndarray, fields: Fields, size: Size, seed: int
+    body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
     """Throughput against the number of bones that start each point."""
     every = part_groups(body.tree, "paper")["full"].bones
     rows = []
     for path, name in (("guided", "mlp"), ("grid", "grid")):
+        tables = guides if path == "guided" else fields
         cases = hard_problems(
             body, getattr(fields, name), vertices,
             degrees=20.0, frames=2, count=size.points, seed=seed,
         )  # fmt: skip
         for count in size.bones:
             table = start_table(body.tree, "full", {"full": Group(every[:count])})
-            search = compiled(path, getattr(fields, name), fields, table, cases[0])
-            row = fast_row(search, cases, fields, path, size.repeats)
+            search = compiled(path, getattr(fields, name), tables, table, cases[0])
+            row = fast_row(search, cases, tables, path, size.repeats)
             label = {"path": path, "field": name, "starts": f"{count} bones", "pose_deg": 20.0}
             rows.append({"table": "bones", "bones": count, **label, **row})
             print_rows(rows[-1:], COLUMNS)
@@ -424,7 +442,7 @@ def resolution_table(
 
 
 def contact_table(
-    body: BodyModel, vertices: np.ndarray, fields: Fields, size: Size, seed: int
+    body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
     """Whether every root is found where the body touches itself."""
     poses = contact_poses(body, vertices, size.contacts)
@@ -456,7 +474,7 @@ def contact_table(
                             pose(fields.grid, transforms), x, part, transforms, t, keep=keep
                         )
                     else:
-                        guide = pose(fields.grid, transforms) if path == "guided" else None
+                        guide = pose(guides.grid, transforms) if path == "guided" else None
                         roots = search_field(f, x, part, transforms, t, guide=guide, keep=keep)
                     return np.asarray(roots.x_c), np.asarray(roots.valid)
 
@@ -509,11 +527,12 @@ def main() -> None:
     vertices = mean_canonical_vertices(body)
     mlp = paper_field(body, steps, cache=args.cache_dir)
     fields = tabulated(body, vertices, mlp, size.grid_mm)
-    rows = paths_table(body, vertices, fields, size, args.seed)
-    rows += batch_table(body, vertices, fields, size, args.seed)
-    rows += bones_table(body, vertices, fields, size, args.seed)
+    guides = tabulated(body, vertices, mlp, size.guide_mm)
+    rows = paths_table(body, vertices, fields, guides, size, args.seed)
+    rows += batch_table(body, vertices, fields, guides, size, args.seed)
+    rows += bones_table(body, vertices, fields, guides, size, args.seed)
     rows += resolution_table(body, vertices, mlp, size, args.seed)
-    rows += contact_table(body, vertices, fields, size, args.seed)
+    rows += contact_table(body, vertices, fields, guides, size, args.seed)
     header = {
         "question": "throughput and recall of the searches",
         **describe_machine(),
@@ -525,8 +544,11 @@ def main() -> None:
         "point_law": "3 of 6 body, 1 face, 1 each hand; 5 mm rms an axis around the mean shape",
         "tabulate_s": fields.tabulate_s,
         "pose_s": fields.pose_s,
+        "guide_tabulate_s": guides.tabulate_s,
+        "guide_pose_s": guides.pose_s,
         "tables_shared_by_points": SHARED_BY,
         "grid_nodes": fields.grid.grids.num_nodes,
+        "guide_nodes": guides.grid.grids.num_nodes,
     }
     if args.json:
         write_json(args.json, {"header": header, "rows": rows})

@@ -222,6 +222,7 @@ _PATH_COLUMNS = (
     ("recall_body", "body", 4),
     ("recall_face", "face", 4),
     ("recall_hands", "hands", 4),
+    ("recall_plain_points", "the plain path's points", 4),
     ("residual_max_um", "largest residual, µm", 1),
     ("steps_per_start", "steps a start", 1),
     ("starts_per_point", "starts a point", 1),
@@ -265,7 +266,8 @@ def paths_view(degrees: float) -> Callable[[dict[str, Any]], str]:
         rows = [["path", "starts", *(label for _, label, _ in _PATH_COLUMNS)]]
         for row in _of_table(record, "paths"):
             if row["pose_deg"] == degrees:
-                row = {**row, "residual_max_um": 1e6 * row["residual_max_m"]}
+                row = {"recall_plain_points": row["recall_all"], **row}
+                row["residual_max_um"] = 1e6 * row["residual_max_m"]
                 name = _PATHS[row["path"], row["field"]]
                 rows.append([name, f"`{row['starts']}`", *_cells(row, _PATH_COLUMNS)])
         return _with_run(rows, record)
@@ -440,8 +442,9 @@ def _with_run(rows: list[list[str]], record: dict[str, Any]) -> str:
         return "Not part of a quick run."
     grid = ""
     if "grid_mm" in header:
-        spacing = ", ".join(f"{value:g}" for value in header["grid_mm"])
-        grid = f", grid of {spacing} mm (body, hands, face)"
+        spacing = (header["grid_mm"], header.get("guide_mm", header["grid_mm"]))
+        grid, guide = (", ".join(f"{value:g}" for value in mm) for mm in spacing)
+        grid = f", grid of {grid} mm and guide of {guide} mm (body, hands, face)"
     return (
         f"{_table(rows)}\n\n{_sentence(_machine(header))}; {size} run, seed {header['seed']}, "
         f"network fitted in {header['prefit_steps']} steps{grid}."

@@ -28,7 +28,7 @@ FIELD_SOLVER = Broyden(atol=1e-5, divergence=DIVERGENCE)
 NEAR_SOLVER = ClosedFormNewton(atol=5e-4, divergence=DIVERGENCE)
 NEAR_MORE = 2
 # Starts of a point that have come this close, in metres, are on their way to one root.
-MERGE = 1e-3
+MERGE = 2e-4
 # Points searched at a time: bounds memory, and costs nothing above a few thousand.
 CHUNK = 8192
 
@@ -45,7 +45,7 @@ def search_grid(
     starts: StartTable,
     *,
     solver: optx.AbstractRootFinder = GRID_SOLVER,
-    keep: int = 4,
+    keep: int = 6,
     max_steps: int = 15,
     width: int = 8192,
     merge: float = MERGE,
@@ -82,7 +82,7 @@ def search_field(
     *,
     guide: PosedGrid | None = None,
     solver: Broyden = FIELD_SOLVER,
-    keep: int = 4,
+    keep: int = 6,
     max_steps: int = 50,
     width: int = 2048,
     merge: float = MERGE,
