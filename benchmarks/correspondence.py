@@ -41,7 +41,7 @@ from search_problems import (
 from self_contact import contact_points, contact_poses, inner_nodes, score
 
 import xavatar_jax as xa
-from xavatar_jax.body import PARTS, BodyModel
+from xavatar_jax.body import BodyModel
 from xavatar_jax.correspondence import (
     Group,
     StartSet,
@@ -52,6 +52,7 @@ from xavatar_jax.correspondence import (
     search_grid,
     start_table,
 )
+from xavatar_jax.correspondence.starts import groups_by_part
 from xavatar_jax.fields import (
     AbstractSkinningField,
     GridSpacing,
@@ -78,7 +79,7 @@ class Size:
     """How much is measured; spacings in mm as body, hands, face."""
 
     prefit_steps: int = FULL_PREFIT
-    starts: tuple[StartSet, ...] = ("paper", "part_aware", "full", "body")
+    starts: tuple[StartSet, ...] = ("paper", "part_aware", "all_bones", "full", "body")
     degrees: tuple[float, ...] = (20.0, 40.0)
     frames: int = 4
     points: int = 6000
@@ -201,10 +202,8 @@ def plain_row(
 
     And which points of all problems these are.
     """
-    by_part = starts in ("paper", "part_aware")
-    groups = part_groups(body.tree, starts if by_part else "paper")
     # Points of one group are searched together.
-    of_part = [groups[name if by_part else starts].bones for name in PARTS]
+    of_part = [group.bones for group in groups_by_part(body.tree, starts).values()]
     spent, compile_s, lanes, steps = 0.0, 0.0, 0, 0
     hit, parts, residuals = [], [], []
     asked = np.zeros((len(problems), size.points), bool)
@@ -376,7 +375,7 @@ def bones_table(
             degrees=20.0, frames=2, count=size.points, seed=seed,
         )  # fmt: skip
         for count in size.bones:
-            table = start_table(body.tree, "full", {"full": Group(every[:count])})
+            table = start_table(body.tree, "all_bones", {"full": Group(every[:count])})
             search = compiled(path, getattr(fields, name), tables, table, cases[0])
             row = fast_row(search, cases, tables, path, size.repeats)
             label = {"path": path, "field": name, "starts": f"{count} bones", "pose_deg": 20.0}
@@ -449,6 +448,7 @@ def contact_table(
     nodes = inner_nodes(body, vertices, fields.grid.grids)
     tables = (
         ("full", start_table(body.tree, "full"), "label"),
+        ("all_bones", start_table(body.tree, "all_bones"), "label"),
         ("part_aware", start_table(body.tree, "part_aware"), "label"),
         ("part_aware, both parts", start_table(body.tree, "part_aware", pairs=True), "pair_row"),
         ("paper, both parts", start_table(body.tree, "paper", pairs=True), "pair_row"),
@@ -495,7 +495,7 @@ def draw(rows: list[dict[str, Any]], path: str) -> None:
         if row["table"] == "bones":
             bones.setdefault(names[row["path"]], []).append((row["bones"], row["points_per_s"]))
     for row in rows:
-        count = {"body": 9, "full": 45}.get(row.get("starts", ""))
+        count = {"body": 9, "all_bones": 45}.get(row.get("starts", ""))
         measured = (row["table"], row.get("path"), row.get("field"), row.get("pose_deg"))
         if bones and count and measured == ("paths", "plain", "mlp", 20.0):
             bones.setdefault("network, plain path", []).append((count, row["points_per_s"]))

@@ -42,8 +42,8 @@ from xavatar_jax.training.pool import FramePool, label_frames
 from xavatar_jax.training.prefit import initial_fields
 from xavatar_jax.training.progress import progress
 
-STARTS: tuple[StartSet, ...] = ("paper", "full", "body")
-NAMES = {"paper": "part-aware", "full": "all bones (A2)", "body": "body bones (A1)"}
+STARTS: tuple[StartSet, ...] = ("paper", "all_bones", "body")
+NAMES = {"paper": "part-aware", "all_bones": "all bones (A2)", "body": "body bones (A1)"}
 
 
 def benchmark_config(quick: bool, seed: int) -> FitConfig:

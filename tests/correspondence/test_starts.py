@@ -42,9 +42,10 @@ def test_own_groups_of_smplx_hold_the_published_ones():
     groups = part_groups(TREES["smplx"])
     assert groups["body"] == Group(tuple(sorted({*BODY, *FEET, *NECK})))
     assert groups["face"] == groups["eyes_mouth"] == Group(FACE, FACE)
-    assert groups["left_hand"] == Group(LEFT, (25, 28, 31, 34, 37))
-    assert groups["right_hand"] == Group(RIGHT, (40, 43, 46, 49, 52))
-    assert groups["full"] == Group(FULL)
+    assert groups["left_hand"] == Group(LEFT, tuple(range(25, 40)))
+    assert groups["right_hand"] == Group(RIGHT, tuple(range(40, 55)))
+    every = tuple(sorted({*FULL, *FEET, *NECK}))
+    assert groups["full"] == Group(every, (*FACE, *range(25, 55)))
 
 
 def test_groups_of_smpl_and_mano():
@@ -71,15 +72,23 @@ def rows(table):
 
 
 @pytest.mark.parametrize("kind", TREES)
-@pytest.mark.parametrize("starts", ["part_aware", "paper", "body", "full"])
-def test_the_table_lists_each_parts_group(kind, starts):
+@pytest.mark.parametrize(
+    ("starts", "of", "one"),
+    [
+        ("part_aware", "part_aware", None),
+        ("paper", "paper", None),
+        ("full", "part_aware", "full"),
+        ("all_bones", "paper", "full"),
+        ("body", "paper", "body"),
+    ],
+)
+def test_the_table_lists_each_parts_group(kind, starts, of, one):
     tree = TREES[kind]
     table = start_table(tree, starts)
-    by_part = starts in ("part_aware", "paper")
-    groups = part_groups(tree, starts if by_part else "paper")
+    groups = part_groups(tree, of)
     assert table.index.shape == table.mask.shape == (len(PARTS), table.width)
     for row, part in zip(rows(table), PARTS, strict=True):
-        group = groups[part if by_part else starts]
+        group = groups[one or part]
         assert row == (*group.bones, *(tree.num_joints + j for j in group.joints))
     # The padding too.
     assert ((table.index >= 0) & (table.index < 2 * tree.num_joints)).all()

@@ -39,7 +39,7 @@ def leaves(values, path=()):
     ("name", "entry", "value"),
     [
         ("A1", ("search", "starts"), "body"),
-        ("A2", ("search", "starts"), "full"),
+        ("A2", ("search", "starts"), "all_bones"),
         ("A3", ("points", "uniform"), True),
         ("A4", ("losses", "surface"), 0.0),
     ],

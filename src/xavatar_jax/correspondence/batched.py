@@ -24,9 +24,10 @@ from .starts import StartTable, pull_back_all
 GRID_SOLVER = ClosedFormNewton(atol=1e-5, divergence=DIVERGENCE)
 FIELD_SOLVER = Broyden(atol=1e-5, divergence=DIVERGENCE)
 # What is searched on a guide is moved on afterwards: near is enough, and what ends at the edge of a
-# fold of one field may have a root in the other. Such places repeat, so more of them are kept.
-NEAR_SOLVER = ClosedFormNewton(atol=5e-4, divergence=DIVERGENCE)
-NEAR_MORE = 2
+# fold of one field may have a root in the other. Such places repeat, so more of them are kept, and
+# none is merged: two that are near on the guide may be two roots of the field.
+NEAR_SOLVER = ClosedFormNewton(atol=1e-3, divergence=DIVERGENCE)
+NEAR_MORE = 6
 # Starts of a point that have come this close, in metres, are on their way to one root.
 MERGE = 2e-4
 # Points searched at a time: bounds memory, and costs nothing above a few thousand.
@@ -91,10 +92,10 @@ def search_field(
     """Roots of any field, for points with part labels.
 
     Without a `guide`, by Broyden's method from the exact Jacobian at each start, one query of the
-    field a step. With a `guide`, the same field tabulated and posed, the search runs on that to
-    half a millimetre, and the few distinct places found are moved to the field's own roots by
-    Newton's method: the residuals are the field's, at a handful of queries a point. Other
-    arguments are as for `search_grid`.
+    field a step. With a `guide`, the same field tabulated and posed, the search runs on that to a
+    millimetre, and the few distinct places found are moved to the field's own roots by Newton's
+    method: the residuals are the field's, at a handful of queries a point. Other arguments are as
+    for `search_grid`; with a guide, starts are not merged.
     """
     if guide is not None:
         near = search_grid(
@@ -105,7 +106,7 @@ def search_field(
             starts,
             solver=NEAR_SOLVER,
             keep=keep + NEAR_MORE,
-            merge=merge,
+            merge=0.0,
             chunk=chunk,
         )
         return polish(field, near, x_d, transforms, keep=keep, atol=solver.atol, width=width)

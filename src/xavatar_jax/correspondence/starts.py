@@ -16,8 +16,18 @@ from jaxtyping import Array, Bool, Float, Int
 from ..body import PARTS
 from ..kinematics import KinematicTree, inverse_3x3
 
-StartSet = Literal["part_aware", "paper", "body", "full"]
-"""Starts of a point: of its part (our own groups, or the paper's), of the body, or of all parts."""
+StartSet = Literal["part_aware", "paper", "full", "all_bones", "body"]
+"""Starts of a point: of its part (our own groups, or the paper's), of all parts (ours, or the
+paper's), or of the body."""
+
+_Groups = Literal["part_aware", "paper"]
+_BY_PART: tuple[_Groups, ...] = ("part_aware", "paper")
+# Of which groups, and the one of them that every point takes.
+_OF_ALL: dict[str, tuple[_Groups, str]] = {
+    "full": ("part_aware", "full"),
+    "all_bones": ("paper", "full"),
+    "body": ("paper", "body"),
+}
 
 _LIMBS = (
     *("left_hip", "right_hip", "left_knee", "right_knee"),
@@ -66,14 +76,15 @@ class StartTable(eqx.Module):
         return self.index.shape[1]
 
 
-def part_groups(tree: KinematicTree, starts: StartSet = "part_aware") -> Mapping[str, Group]:
+def part_groups(tree: KinematicTree, starts: _Groups = "part_aware") -> Mapping[str, Group]:
     """Starts for a point of each part, and `full` for a point of any.
 
     "paper" gives, on the SMPL family, the groups of X-Avatar's released code: `body` is the root
     with hips, knees, shoulders and elbows, `face` the neck, head and jaw, a hand its wrist and
     fingers, `full` all of these and the eyes without the neck. "part_aware" adds to them what they
     were measured to lose: to the body the feet and the neck, to the face the joints between neck,
-    head and jaw, to a hand its knuckles. A foot is an ankle's child, a knuckle a wrist's.
+    head and jaw, to a hand the joints of its fingers; `full` has all that a part has. A foot is an
+    ankle's child, a finger what is below a wrist.
 
     On a tree with other names a group with no joint by these names takes every joint that belongs
     to no hand and no face.
@@ -93,26 +104,45 @@ def part_groups(tree: KinematicTree, starts: StartSet = "part_aware") -> Mapping
     rest = tuple(j for j in range(tree.num_joints) if j not in special)
     limbs = tree.indices(*_LIMBS)
     body = (0, *limbs) if limbs else (rest or (0,))
-    full = _ordered({*body, *left, *right, *below("head")})
+    every = {*body, *left, *right, *below("head")}
     own = starts == "part_aware"
     if own and limbs:
         body += (*children("left_ankle"), *children("right_ankle"), *tree.indices("neck"))
     body = _ordered(body)
     face_group = Group(_ordered(face), _ordered(face) if own else ()) if face else Group(body)
 
-    def hand(bones: tuple[int, ...], wrist: str) -> Group:
-        return Group(_ordered(bones), children(wrist) if own else ()) if bones else Group(body)
+    def hand(bones: tuple[int, ...]) -> Group:
+        # The first of a subtree is the wrist itself.
+        return Group(_ordered(bones), _ordered(bones[1:]) if own else ()) if bones else Group(body)
 
-    return MappingProxyType(
-        {
-            "body": Group(body),
-            "face": face_group,
-            "left_hand": hand(left, "left_wrist"),
-            "right_hand": hand(right, "right_wrist"),
-            "eyes_mouth": face_group,
-            "full": Group(full),
-        }
-    )
+    groups = {
+        "body": Group(body),
+        "face": face_group,
+        "left_hand": hand(left),
+        "right_hand": hand(right),
+        "eyes_mouth": face_group,
+    }
+    if own:
+        every |= {j for group in groups.values() for j in group.bones}
+    joints = _ordered(j for group in groups.values() for j in group.joints)
+    return MappingProxyType({**groups, "full": Group(_ordered(every), joints)})
+
+
+def groups_by_part(
+    tree: KinematicTree,
+    starts: StartSet = "part_aware",
+    groups: Mapping[str, Group | tuple[int, ...]] | None = None,
+) -> dict[str, Group]:
+    """The group that each of `PARTS` starts with; arguments and errors as of `start_table`."""
+    if starts not in (*_BY_PART, *_OF_ALL):
+        raise ValueError(f"unknown start set {starts!r}: {', '.join((*_BY_PART, *_OF_ALL))}")
+    of, one = _OF_ALL.get(starts, (starts, None))
+    known = dict(part_groups(tree, of))
+    for name, group in (groups or {}).items():
+        if name not in known:
+            raise ValueError(f"unknown part {name!r}; the parts are {', '.join(known)}")
+        known[name] = group if isinstance(group, Group) else Group(tuple(group))
+    return {part: known[one or part] for part in PARTS}
 
 
 def start_table(
@@ -127,24 +157,15 @@ def start_table(
     With `pairs` there are more rows, for points close to two parts, which take the starts of
     both: `PAIR_ROWS[a, b]` is the row of parts a and b.
 
-    `starts` is "part_aware" (each part its own, the library's groups), "paper" (each part its own,
-    X-Avatar's groups), "body" (ablation A1) or "full" (A2) for every point. `groups` overrides
-    some or all of them; a plain tuple lists bones.
+    `starts` is "part_aware" (each part its own, the library's groups) or "paper" (X-Avatar's), or
+    for every point the same: "full" (what any part has), "all_bones" (the paper's 45, ablation A2)
+    or "body" (its nine, A1). `groups` overrides some or all of them; a plain tuple lists bones.
 
     **Raises:** `ValueError` for an unknown part or start set, an empty group, or a bone out of
     range.
     """
-    if starts not in ("part_aware", "paper", "body", "full"):
-        raise ValueError(f"unknown start set {starts!r}: part_aware, paper, body or full")
-    by_part = starts in ("part_aware", "paper")
-    known = dict(part_groups(tree, starts if by_part else "paper"))
-    for name, group in (groups or {}).items():
-        if name not in known:
-            raise ValueError(f"unknown part {name!r}; the parts are {', '.join(known)}")
-        known[name] = group if isinstance(group, Group) else Group(tuple(group))
     rows = []
-    for part in PARTS:
-        group = known[part if by_part else starts]
+    for part, group in groups_by_part(tree, starts, groups).items():
         check_bones(group.bones, tree.num_joints, what=f"start bones of {part}")
         if group.joints:
             check_bones(group.joints, tree.num_joints, what=f"start joints of {part}")

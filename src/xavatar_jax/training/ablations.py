@@ -16,7 +16,7 @@ def body_starts(config: FitConfig) -> FitConfig:
 
 def all_starts(config: FitConfig) -> FitConfig:
     """A2: the search of every point starts at all bones; points are drawn by part as before."""
-    return replace(config, search=replace(config.search, starts="full"))
+    return replace(config, search=replace(config.search, starts="all_bones"))
 
 
 def uniform_sampling(config: FitConfig) -> FitConfig:
