@@ -394,7 +394,7 @@ def medians_view(
         from resumable import medians
 
         rows = [[*shown, *(label for _, label, _ in columns)]]
-        for row in medians(record["rows"], by):
+        for row in sorted(medians(record["rows"], by), key=lambda row: row.get("minutes", 0)):
             rows.append([*(f"{row[name]}" for name in shown), *_cells(row, columns)])
         header = record["header"]
         budget = f", {header['minutes']:g} minutes a run" if "minutes" in header else ""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..correspondence.batched import CHUNK
 from ..kinematics import skin_points
 from ..training import AvatarFields, FitConfig
 
@@ -55,8 +56,8 @@ def skin(fields: AvatarFields, points: Array, transforms: Array) -> Array:
 
 
 def padded_size(count: int) -> int:
-    """The next power of two, 256 at least: so many points as to fill one of few sizes."""
-    return max(256, 1 << (count - 1).bit_length())
+    """The next of few sizes: powers of two from 256, then multiples of a search's chunk."""
+    return count + -count % CHUNK if count > CHUNK else max(256, 1 << (count - 1).bit_length())
 
 
 def in_batches(function: Any, points: np.ndarray, batch: int) -> np.ndarray:
