@@ -21,9 +21,10 @@ StartSet = Literal["part_aware", "paper", "full", "all_bones", "body"]
 paper's), or of the body."""
 
 _Groups = Literal["part_aware", "paper"]
-_BY_PART: tuple[_Groups, ...] = ("part_aware", "paper")
-# Of which groups, and the one of them that every point takes.
-_OF_ALL: dict[str, tuple[_Groups, str]] = {
+# Of which groups, and the one of them that every point takes if all take the same.
+_CHOICES: dict[str, tuple[_Groups, str | None]] = {
+    "part_aware": ("part_aware", None),
+    "paper": ("paper", None),
     "full": ("part_aware", "full"),
     "all_bones": ("paper", "full"),
     "body": ("paper", "body"),
@@ -134,9 +135,9 @@ def groups_by_part(
     groups: Mapping[str, Group | tuple[int, ...]] | None = None,
 ) -> dict[str, Group]:
     """The group that each of `PARTS` starts with; arguments and errors as of `start_table`."""
-    if starts not in (*_BY_PART, *_OF_ALL):
-        raise ValueError(f"unknown start set {starts!r}: {', '.join((*_BY_PART, *_OF_ALL))}")
-    of, one = _OF_ALL.get(starts, (starts, None))
+    if starts not in _CHOICES:
+        raise ValueError(f"unknown start set {starts!r}: {', '.join(_CHOICES)}")
+    of, one = _CHOICES[starts]
     known = dict(part_groups(tree, of))
     for name, group in (groups or {}).items():
         if name not in known:
