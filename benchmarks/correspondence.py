@@ -231,6 +231,7 @@ def plain_row(
         "points": len(np.concatenate(hit)) // len(problems),
         "points_per_s": len(np.concatenate(hit)) / spent,
         **recall(np.concatenate(hit), np.concatenate(parts)),
+        "recall_plain_points": float(np.concatenate(hit).mean()),
         "residual_max_m": float(np.concatenate(residuals).max()),
         "residual_median_m": float(np.median(np.concatenate(residuals))),
         "steps_per_start": steps / lanes,
