@@ -17,13 +17,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from charts import log_chart
 from jaxtyping import UInt8
 from methods import METHODS, learn
 from resumable import Row, add_options, every, fill, medians, score
 
 import xavatar_jax as xa
 from xavatar_jax.render import grid_picture, save_png
+from xavatar_jax.report import line_chart
 
 MINUTES = (1.0, 1.5, 2.0, 4.0, 7.0, 10.0, 20.0, 30.0)
 NAMES = ("quick", "paper", "SNARF", "SCANimate")
@@ -48,7 +48,7 @@ def picture(rows: Sequence[Row], minutes: Sequence[float]) -> UInt8[np.ndarray, 
             if row.get(key):
                 lines.setdefault(row["name"], []).append((row["minutes"], row[key]))
         ticks = [m for m in minutes if any(m == x for line in lines.values() for x, _ in line)]
-        charts.append(log_chart(lines, title=title, x_label="minutes", x_ticks=ticks))
+        charts.append(line_chart(lines, title=title, x_label="minutes", x_ticks=ticks))
     return grid_picture([charts])
 
 

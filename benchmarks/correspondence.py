@@ -22,7 +22,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from charts import log_chart
 from jaxtyping import Array
 from search_problems import (
     FULL_PREFIT,
@@ -63,7 +62,7 @@ from xavatar_jax.fields import (
     tabulate,
 )
 from xavatar_jax.render import grid_picture, save_png
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine, line_chart, write_json
 
 # Points that share one tabulating and one blending of transforms in `points_per_s_with_tables`.
 SHARED_BY = 100_000
@@ -504,11 +503,13 @@ def draw(rows: list[dict[str, Any]], path: str) -> None:
     charts = []
     if batches:
         ticks = sorted({p[0] for line in batches.values() for p in line})
-        charts.append(log_chart(batches, title="points/s", x_label="points at once", x_ticks=ticks))
+        charts.append(
+            line_chart(batches, title="points/s", x_label="points at once", x_ticks=ticks)
+        )
     if bones:
         ticks = sorted({p[0] for line in bones.values() for p in line})
         charts.append(
-            log_chart(bones, title="points/s", x_label="bones that start a point", x_ticks=ticks)
+            line_chart(bones, title="points/s", x_label="bones that start a point", x_ticks=ticks)
         )
     save_png(path, grid_picture([charts]))
 

@@ -19,6 +19,7 @@ import numpy as np
 import xavatar_jax as xa
 from xavatar_jax.geometry import closest_points
 from xavatar_jax.render import (
+    SKIN_COLOR,
     color_bar,
     error_colors,
     frame_view,
@@ -28,8 +29,6 @@ from xavatar_jax.render import (
     turntable,
     weight_colors,
 )
-
-SKIN = (0.80, 0.66, 0.57)
 
 
 def clock(work: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
@@ -96,14 +95,14 @@ def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> Non
         "error": (replace(mesh, colors=error_colors(1000 * distance, 2.0)), "error"),
     }
     row = [
-        render_mesh(shown, camera, (310, 500), shading=shading, base_color=SKIN, ground=True)
+        render_mesh(shown, camera, (310, 500), shading=shading, base_color=SKIN_COLOR, ground=True)
         for shown, shading in ways.values()
     ]
     sheet = grid_picture([[*row, color_bar(2.0, (70, 500))]], column_labels=[*ways, ""], gap=4)
     save_png(folder / "shadings.png", sheet)
     save_png(
         folder / "turntable.png",
-        grid_picture([turntable(mesh, 6, (210, 420), base_color=SKIN)], gap=0),
+        grid_picture([turntable(mesh, 6, (210, 420), base_color=SKIN_COLOR)], gap=0),
     )
 
 

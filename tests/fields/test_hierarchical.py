@@ -103,6 +103,26 @@ def test_weights_sum_to_one_in_single_precision(kind, rng):
     np.testing.assert_allclose(weights.sum(1), 1.0, atol=TOLERANCE["sum_to_one"])
 
 
+def test_derivatives_of_weights_near_one_keep_their_digits_in_single_precision(rng):
+    """Where one bone has all but a hundred thousandth, its weight's derivative is of that size."""
+    tree = TREES["smplx"]
+    logits = rng.normal(size=(50, num_logits(tree)))
+    to_left_thumb = [0, 3, 6, 55, 9, 13, 16, 18, 20, 57, 37]
+    logits[:, to_left_thumb] += 14
+    logits[:, 38] -= 14  # which keeps what arrives
+    way = rng.normal(size=logits.shape)
+
+    @jax.jit
+    def slope(logits, way):
+        return jax.jvp(lambda v: hierarchical_softmax(tree, v), (logits,), (way,))[1]
+
+    found = np.asarray(slope(jnp.asarray(logits, jnp.float32), jnp.asarray(way, jnp.float32)))
+    with jax.enable_x64(True):
+        exact = np.asarray(slope(jnp.asarray(logits), jnp.asarray(way)))
+    gap = np.linalg.norm(found - exact, axis=1) / np.linalg.norm(exact, axis=1)
+    assert gap.max() < 1e-5
+
+
 @settings(max_examples=8, deadline=None)
 @given(trees(), st.integers(0, 2**31))
 def test_weights_of_any_tree(parents, seed):

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xavatar_jax.files import flatten_named, load_arrays, save_arrays, unflatten_named
+from xavatar_jax.files import (
+    flatten_named,
+    load_arrays,
+    load_header,
+    save_arrays,
+    unflatten_named,
+)
 
 
 class Layer(eqx.Module):
@@ -41,6 +47,7 @@ def test_round_trip(tmp_path):
     save_arrays(tmp_path / "a.npz", arrays, header)
     found, found_header = load_arrays(tmp_path / "a.npz")
     assert found_header == header
+    assert load_header(tmp_path / "a.npz") == header
     assert set(found) == set(arrays)
     for name, value in arrays.items():
         np.testing.assert_array_equal(found[name], value)
@@ -48,6 +55,12 @@ def test_round_trip(tmp_path):
     # No pickle inside: NumPy reads it with pickles forbidden.
     with np.load(tmp_path / "a.npz", allow_pickle=False) as file:
         np.testing.assert_array_equal(file["f32"], arrays["f32"])
+
+
+def test_objects_are_not_pickled(tmp_path):
+    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
+        save_arrays(tmp_path / "a.npz", {"any": np.array([{}, None], object)}, {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_tree_round_trip_by_path(tmp_path):

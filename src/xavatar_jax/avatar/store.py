@@ -12,7 +12,14 @@ import equinox as eqx
 from .._version import __version__
 from ..body import BodyModel, load_body, synthetic_body
 from ..fields import HashGeometry
-from ..files import flatten_named, load_arrays, refuse_newer, save_arrays, unflatten_named
+from ..files import (
+    flatten_named,
+    load_arrays,
+    load_header,
+    refuse_newer,
+    save_arrays,
+    unflatten_named,
+)
 from ..training import (
     AvatarFields,
     config_from_dict,
@@ -65,7 +72,8 @@ def load_avatar(
     **Raises:** `FileNotFoundError` if the body's file is gone, `ValueError` if the body given, or
     the file found, is another one, or if the avatar file is damaged or from a newer version.
     """
-    arrays, header = _read(path)
+    arrays, header = load_arrays(path)
+    check_header(path, header)
     known = header["body"]
     body = _find_body(path, known, None) if body is None else body
     if body.source.checksum != known["checksum"]:
@@ -100,14 +108,9 @@ def load_avatar_body(
 
     **Raises:** as `load_avatar` and `load_body`.
     """
-    return _find_body(path, _read(path)[1]["body"], file)
-
-
-def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arrays and header of an avatar file."""
-    arrays, header = load_arrays(path)
+    header = load_header(path)
     check_header(path, header)
-    return arrays, header
+    return _find_body(path, header["body"], file)
 
 
 def check_header(path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:

@@ -40,7 +40,7 @@ def _own_kind(file: Path) -> dict[str, Any] | None:
     from ..files import load_arrays, load_npz
     from ..files.trees import HEADER
 
-    if not file.is_file() or _head(file) != _NPZ_HEAD or HEADER not in load_npz(file):
+    if not file.is_file() or _head(file) != _NPZ_HEAD or not load_npz(file, only=HEADER):
         return None
     arrays, header = load_arrays(file)
     size = sum(array.nbytes for array in arrays.values())

@@ -98,8 +98,9 @@ def hierarchical_softmax(
     none = jnp.zeros_like(logits[..., :1])  # the group of joints that have no siblings
     if lay.sibling_mask.any():
         # Shares are taken from the largest sibling's logit: in float32 the difference to a sum of
-        # large logits would lose the digits that make the shares sum to one.
-        peak = jax.lax.stop_gradient(jnp.max(group_logits, axis=-1))
+        # large logits would lose the digits that make the shares sum to one. Derivatives likewise:
+        # those of a share near one are differences to that logit's.
+        peak = jnp.max(group_logits, axis=-1)
         total = jax.nn.logsumexp(group_logits - peak[..., None], axis=-1)
         peak, total = (jnp.concatenate([value, none], axis=-1) for value in (peak, total))
     else:

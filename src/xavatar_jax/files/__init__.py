@@ -6,6 +6,7 @@ from .cache import cache_dir as cache_dir
 from .checksum import file_checksum as file_checksum
 from .trees import flatten_named as flatten_named
 from .trees import load_arrays as load_arrays
+from .trees import load_header as load_header
 from .trees import refuse_newer as refuse_newer
 from .trees import save_arrays as save_arrays
 from .trees import unflatten_named as unflatten_named

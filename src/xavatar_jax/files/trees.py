@@ -24,7 +24,7 @@ def save_arrays(
     encoded = np.frombuffer(json.dumps(dict(header)).encode(), np.uint8)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         named: dict[str, Any] = {k: np.asarray(v) for k, v in arrays.items()}
-        np.savez(file, **{HEADER: encoded}, **named)
+        np.savez(file, allow_pickle=False, **{HEADER: encoded}, **named)
 
 
 def load_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -33,10 +33,21 @@ def load_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
     **Raises:** `ValueError` naming the file if it was not written by `save_arrays`.
     """
     entries = load_npz(path)
+    return entries, _pop_header(path, entries)
+
+
+def load_header(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The header of what `save_arrays` wrote, without reading the arrays.
+
+    **Raises:** as `load_arrays`.
+    """
+    return _pop_header(path, load_npz(path, only=HEADER))
+
+
+def _pop_header(path: str | os.PathLike[str], entries: dict[str, Any]) -> dict[str, Any]:
     if HEADER not in entries:
         raise ValueError(f"{os.fspath(path)}: no {HEADER} inside, so it is not one of our files")
-    header = json.loads(bytes(entries.pop(HEADER)).decode())
-    return entries, header
+    return json.loads(bytes(entries.pop(HEADER)).decode())
 
 
 def refuse_newer(

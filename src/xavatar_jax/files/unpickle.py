@@ -182,8 +182,8 @@ def _read_npy(file: BinaryIO) -> Any:
     return data.reshape(shape[::-1]).T.copy() if fortran else data.reshape(shape).copy()
 
 
-def load_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read every array of an `.npz`; object arrays are unpickled under restriction.
+def load_npz(path: str | os.PathLike[str], only: str | None = None) -> dict[str, Any]:
+    """Read every array of an `.npz`, or `only` one; object arrays are unpickled under restriction.
 
     A zero-dimensional object array comes back as the object inside (a dict, most often).
 
@@ -194,6 +194,8 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(Path(path)) as archive:
             for name in archive.namelist():
+                if only not in (None, name.removesuffix(".npy")):
+                    continue
                 data = _read_npy(io.BytesIO(archive.read(name)))
                 if isinstance(data, np.ndarray) and data.dtype.hasobject and data.shape == ():
                     data = _plain(data.item())

@@ -6,6 +6,8 @@ from .camera import orbit_views as orbit_views
 from .camera import part_view as part_view
 from .colormap import color_bar as color_bar
 from .colormap import error_colors as error_colors
+from .picture import SKIN_COLOR as SKIN_COLOR
+from .picture import TRUTH_COLOR as TRUTH_COLOR
 from .picture import render_mesh as render_mesh
 from .save import save_gif_animation as save_gif_animation
 from .save import save_png as save_png

@@ -14,6 +14,10 @@ from .subject import Points, Subject
 
 SHADINGS = ("color", "error", "normal", "flat")
 BASE_COLOR = (0.80, 0.74, 0.69)
+SKIN_COLOR = (0.80, 0.66, 0.57)
+"""Of an avatar without colours of its own, sRGB."""
+TRUTH_COLOR = (0.72, 0.74, 0.78)
+"""Of ground truth beside it, sRGB."""
 BACKGROUND = (0.965, 0.965, 0.97)
 # Neighbouring pixels that differ by more than this get more rays: normals, linear albedo, and
 # depth as a part of the mesh's extent.

@@ -1,5 +1,6 @@
 """What a run leaves behind: metrics, pictures, an animation, meshes."""
 
+from .charts import line_chart as line_chart
 from .curves import loss_curves as loss_curves
 from .machine import available_cores as available_cores
 from .machine import describe_machine as describe_machine

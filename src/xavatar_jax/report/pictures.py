@@ -14,6 +14,8 @@ from ..frames import Frame, Frames
 from ..geometry import closest_points
 from ..meshing import Mesh
 from ..render import (
+    SKIN_COLOR,
+    TRUTH_COLOR,
     Camera,
     color_bar,
     error_colors,
@@ -22,9 +24,6 @@ from ..render import (
     part_view,
     render_mesh,
 )
-
-_SKIN = (0.80, 0.66, 0.57)
-_TRUTH = (0.72, 0.74, 0.78)
 
 
 def preview(
@@ -55,8 +54,8 @@ def preview(
         shape = (int(size / tall**0.5), int(size * tall**0.5))
         rows.append(
             [
-                render_mesh(truth, camera, shape, base_color=_TRUTH),
-                render_mesh(mesh, camera, shape, base_color=_SKIN),
+                render_mesh(truth, camera, shape, base_color=TRUTH_COLOR),
+                render_mesh(mesh, camera, shape, base_color=SKIN_COLOR),
                 render_mesh(error, camera, shape, shading="error"),
             ]
         )
@@ -81,8 +80,8 @@ def animation(
         frame = frames[int(k)]
         truth = Mesh(frame.vertices, frame.faces).compute_normals()
         row = [
-            render_mesh(truth, camera, size, base_color=_TRUTH),
-            render_mesh(mesh.compute_normals(), camera, size, base_color=_SKIN),
+            render_mesh(truth, camera, size, base_color=TRUTH_COLOR),
+            render_mesh(mesh.compute_normals(), camera, size, base_color=SKIN_COLOR),
         ]
         pictures.append(grid_picture([row], column_labels=["ground truth", "avatar"]))
     return pictures
@@ -111,7 +110,7 @@ def motion_pictures(
             camera,
             (width, height),
             shading=shading,
-            base_color=_SKIN,
+            base_color=SKIN_COLOR,
             ground=shading == "color",
             ground_height=floor,
         )

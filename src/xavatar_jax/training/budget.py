@@ -10,7 +10,7 @@ from typing import Protocol
 
 import jax
 
-from ..files import load_arrays
+from ..files import load_header
 from .check import notify
 from .config import FitConfig
 
@@ -63,8 +63,7 @@ def as_begun(config: FitConfig, checkpoint: str | os.PathLike[str]) -> FitConfig
     """
     if not Path(checkpoint).exists():
         return config
-    _, header = load_arrays(checkpoint)
-    frames = header.get("history", {}).get("frames", 0)
+    frames = load_header(checkpoint).get("history", {}).get("frames", 0)
     return replace(config, minutes=None, train_frames=frames) if frames else config
 
 

@@ -21,10 +21,9 @@ from ..body import BodyParams, facing
 from ..export import Clip, Rig, limit_influences, rotation_quaternions
 from ..files import atomic_path
 from ..kinematics import TO_Y_UP
-from ..render import WEIGHT_RAMP, bone_palette
+from ..render import SKIN_COLOR, WEIGHT_RAMP, bone_palette
 from .poses import UpAxis, rest_params
 
-_SKIN = (0.80, 0.66, 0.57)
 _INFLUENCES = 8
 # What blend shapes move less than this stays at rest in the page, metres.
 _SMALLEST_MOVE = 2e-5
@@ -148,7 +147,7 @@ def pack(rig: Rig, clip: Clip, scales: Float[np.ndarray, " E"]) -> tuple[dict[st
         "step": step,
         "fps": clip.fps,
         "frames": len(clip),
-        "color": list(_SKIN),
+        "color": list(SKIN_COLOR),
     }
     return manifest, bytes(blob)
 

@@ -75,15 +75,17 @@ class Stage:
             self._show_colored(surface)
 
     def _show_plain(self, surface: Surface) -> None:
+        red, green, blue = (round(255 * c) for c in surface.color)
+        color = (red, green, blue)
         if self._plain is None or self._faces is not surface.faces:
             self._plain = self._scene.add_mesh_simple(
-                _PLAIN, surface.vertices, surface.faces, color=surface.color, side="double"
+                _PLAIN, surface.vertices, surface.faces, color=color, side="double"
             )
             self._faces = surface.faces
         else:
             self._plain.vertices = surface.vertices
-            if tuple(self._plain.color) != surface.color:
-                self._plain.color = surface.color
+            if tuple(self._plain.color) != color:
+                self._plain.color = color
         self._plain.visible = True
         if self._colored is not None:
             self._colored.remove()

@@ -12,7 +12,7 @@ from ..avatar.animate import posed_frame
 from ..body import BodyParams
 from ..frames import Frames
 from ..geometry import closest_points, vertex_normals
-from ..render import error_colors, weight_colors
+from ..render import SKIN_COLOR, TRUTH_COLOR, error_colors, weight_colors
 from .poses import frame_of, turned
 
 AVATAR, NORMALS, WEIGHTS, TRUTH, ERROR = (
@@ -22,8 +22,6 @@ AVATAR, NORMALS, WEIGHTS, TRUTH, ERROR = (
     "ground truth",
     "error",
 )
-SKIN = (207, 168, 145)
-TRUTH_COLOR = (184, 189, 199)
 
 
 @dataclass(frozen=True)
@@ -48,14 +46,14 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh to show: in one colour, or with a colour a vertex. Metres.
+    """A mesh to show: in one colour (sRGB, 0 to 1), or with a colour a vertex. Metres.
 
     - `note`: what is to be said of it.
     """
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
-    color: tuple[int, int, int] = SKIN
+    color: tuple[float, float, float] = SKIN_COLOR
     colors: UInt8[np.ndarray, "V 3"] | None = None
     note: str = ""
 
