@@ -95,6 +95,7 @@ HOW = {
         "a stage of its own"
     ),
     ".venv/bin/python benchmarks/gradients.py --json gradients.json": skip("takes many minutes"),
+    ".venv/bin/python benchmarks/part_borders.py --json borders.json": How(True, "--quick"),
     ".venv/bin/python benchmarks/table1_ablations.py --json table1.json": skip("takes hours"),
     ".venv/bin/python benchmarks/table2_grab.py --json table2.json": skip("takes hours"),
     ".venv/bin/python benchmarks/memory.py --json memory.json": skip("takes many minutes"),

@@ -1,7 +1,8 @@
 """Animation and rigged export of an avatar: how fast, and what is lost for it.
 
 Question: how many frames a second does `Avatar.animate` pose, how far are they from the frames' own
-meshes, and how long does a GLB file of 300 frames take?
+meshes, how long does a GLB file of 300 frames take, and how long the canonical surface at some
+sizes of cells?
 
     python benchmarks/animate.py out/fit_grab/avatar.npz [--quick] [--json FILE]
 
@@ -20,12 +21,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from search_problems import peak_rise_mb
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import Animation, GlbExport
 from xavatar_jax.report import describe_machine, write_json
 
 OFFSETS = ("cached", "none", "exact")
+CELLS_MM = (4.0, 1.5)
 
 
 def held_out_motion(body: xa.BodyModel, frames: int) -> xa.Motion:
@@ -81,6 +84,28 @@ def measure_export(avatar: xa.Avatar, motion: xa.Motion, influences: Any) -> dic
     }
 
 
+def measure_extraction(avatar: xa.Avatar, cell_mm: float) -> dict[str, Any]:
+    """Seconds of a first and a second extraction with cells of one size, and what memory rises."""
+    taken, vertices = [], 0
+
+    def extract() -> None:
+        nonlocal vertices
+        start = time.perf_counter()
+        mesh = avatar.canonical_mesh(cell=cell_mm / 1000, max_vertices=None)
+        taken.append(time.perf_counter() - start)
+        vertices = mesh.num_vertices
+
+    rise = peak_rise_mb(extract)
+    extract()
+    return {
+        "cell_mm": cell_mm,
+        "vertices": vertices,
+        "first_s": taken[0],
+        "seconds": taken[-1],
+        "rss_rise_mb": rise,
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -106,6 +131,8 @@ def main() -> None:
         for offsets in OFFSETS
     ]
     exports = [measure_export(avatar, motion, influences) for influences in (4, 8)]
+    cells = CELLS_MM[:1] if args.quick else CELLS_MM
+    extractions = [measure_extraction(avatar, cell) for cell in cells]
     header = {
         "question": "frames a second of animation, distance to exact frames, time of export",
         **describe_machine(),
@@ -116,8 +143,9 @@ def main() -> None:
         "extraction_s": extracted - start,
         "base_s": ready - extracted,
         "exports": exports,
+        "extractions": extractions,
     }
-    for row in (*rows, *exports):
+    for row in (*rows, *exports, *extractions):
         print(
             ", ".join(
                 f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()

@@ -7,7 +7,10 @@ A *known* root is the canonical point that the field itself carried to the posed
 the same frames, points and field. The plain path, one `optimistix.root_find` a start under `vmap`,
 is the measure of the others; it is given a part of the points, since it is slow.
 
-    python benchmarks/correspondence.py [--quick] [--json FILE] [--picture FILE]
+    python benchmarks/correspondence.py [--quick] [--json FILE] [--picture FILE] [--tables NAME...]
+
+A table is written as it ends. With `--tables`, those named are measured, and the file keeps the
+others.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -23,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from resumable import rows_of
 from search_problems import (
     FULL_PREFIT,
     QUICK_PREFIT,
@@ -299,6 +304,8 @@ def paths_table(
     }
     rows, asked = [], {}
     for starts in size.starts:
+        # Programs take memory maps, of which a process has some 65,000.
+        jax.clear_caches()
         table = start_table(body.tree, starts)
         for path, name in PATHS:
             if path == "plain" and name == "grid" and not size.plain_grid:
@@ -311,7 +318,8 @@ def paths_table(
                     measured, asked[case] = plain_row(body, field, cases, starts, size)
                 else:
                     search = search or compiled(path, field, tables, table, cases[0])
-                    measured = fast_row(search, cases, tables, path, size.repeats, asked.get(case))
+                    repeats = 1 if path == "batched" else size.repeats
+                    measured = fast_row(search, cases, tables, path, repeats, asked.get(case))
                 label = {"path": path, "field": name, "starts": starts, "pose_deg": degrees}
                 rows.append({"table": "paths", **label, **measured})
                 print_rows(rows[-1:], COLUMNS)
@@ -354,8 +362,8 @@ def batch_table(
             field, tables = getattr(fields, name), guides if path == "guided" else fields
             case = one_frame(body, vertices, field, transforms, count, seed)
             search = compiled(path, field, tables, table, case)
-            few = 1 if count >= 300_000 or path == "batched" else size.repeats
-            row = fast_row(search, [case], tables, path, few)
+            repeats = 1 if path == "batched" else size.repeats
+            row = fast_row(search, [case], tables, path, repeats)
             label = {"path": path, "field": name, "starts": "part_aware", "pose_deg": 20.0}
             rows.append({"table": "batches", **label, **row})
             print_rows(rows[-1:], COLUMNS)
@@ -385,10 +393,11 @@ def bones_table(
 
 
 def resolution_table(
-    body: BodyModel, vertices: np.ndarray, mlp: AbstractSkinningField, size: Size, seed: int
+    body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
     """What a grid of each spacing costs, and how near it is to the network."""
-    table, rows = start_table(body.tree, "part_aware"), []
+    del guides  # each row has its own
+    mlp, table, rows = fields.mlp, start_table(body.tree, "part_aware"), []
     weigh = eqx.filter_jit(lambda field, x: jax.vmap(field)(x))
     for mm in size.resolutions_mm:
         fields = tabulated(body, vertices, mlp, mm)
@@ -457,6 +466,7 @@ def contact_table(
     pose = jax.jit(pose_grid)
     rows = []
     for name, params in poses.items():
+        jax.clear_caches()
         made: dict[str, Any] = {}
         for path, of in paths if size.plain_grid else paths[:1]:
             field = getattr(fields, of)
@@ -483,6 +493,15 @@ def contact_table(
                 rows.append({"table": "contact", **label, **shares})
                 print_rows(rows[-1:], tuple(rows[-1])[1:])
     return rows
+
+
+TABLES = {
+    "paths": paths_table,
+    "batches": batch_table,
+    "bones": bones_table,
+    "resolution": resolution_table,
+    "contact": contact_table,
+}
 
 
 def draw(rows: list[dict[str, Any]], path: str) -> None:
@@ -519,6 +538,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small: ends within a minute or two")
     parser.add_argument("--json", help="write header and rows to this file")
     parser.add_argument("--picture", help="write a chart (PNG) to this file")
+    names = ", ".join(TABLES)
+    parser.add_argument("--tables", nargs="+", choices=TABLES, metavar="NAME",
+                        help=f"of {names}; the others stay as they are in the file")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--prefit-steps", type=int, help="steps of fitting the network")
     parser.add_argument("--cache-dir")
@@ -530,11 +552,6 @@ def main() -> None:
     mlp = paper_field(body, steps, cache=args.cache_dir)
     fields = tabulated(body, vertices, mlp, size.grid_mm)
     guides = tabulated(body, vertices, mlp, size.guide_mm)
-    rows = paths_table(body, vertices, fields, guides, size, args.seed)
-    rows += batch_table(body, vertices, fields, guides, size, args.seed)
-    rows += bones_table(body, vertices, fields, guides, size, args.seed)
-    rows += resolution_table(body, vertices, mlp, size, args.seed)
-    rows += contact_table(body, vertices, fields, guides, size, args.seed)
     header = {
         "question": "throughput and recall of the searches",
         **describe_machine(),
@@ -552,9 +569,19 @@ def main() -> None:
         "grid_nodes": fields.grid.grids.num_nodes,
         "guide_nodes": guides.grid.grids.num_nodes,
     }
-    if args.json:
-        write_json(args.json, {"header": header, "rows": rows})
-        print(f"written: {args.json}")
+    rows: list[dict[str, Any]] = []
+    if args.tables and args.json and Path(args.json).exists():
+        same = ("device", "cores", "quick", "seed", "prefit_steps", *asdict(size))
+        rows = rows_of(Path(args.json), header, same)
+    for name in args.tables or TABLES:
+        jax.clear_caches()
+        measured = TABLES[name](body, vertices, fields, guides, size, args.seed)
+        rows = [row for row in rows if row["table"] != name]
+        rows += [{**row, "commit": header["commit"]} for row in measured]
+        if args.json:
+            header["peak_rss_mb"] = describe_machine()["peak_rss_mb"]
+            write_json(args.json, {"header": header, "rows": rows})
+            print(f"written: {args.json}", flush=True)
     if args.picture:
         draw(rows, args.picture)
         print(f"written: {args.picture}")

@@ -80,7 +80,7 @@ def fill(
     header = {"question": question, **describe_machine(), **settings}
     rows: list[Row] = []
     if file is not None and Path(file).exists():
-        rows = _rows_of(Path(file), header, ("device", "cores", "question", *settings))
+        rows = rows_of(Path(file), header, ("device", "cores", "question", *settings))
     failed = []
     for k, job in enumerate(jobs):
         label = ", ".join(str(v) if k == "name" else f"{k} {v}" for k, v in job.items())
@@ -113,8 +113,11 @@ def fill(
     return header, rows
 
 
-def _rows_of(file: Path, header: Mapping[str, Any], same: Iterable[str]) -> list[Row]:
-    """Rows of a table that was begun, if it is this one."""
+def rows_of(file: Path, header: Mapping[str, Any], same: Iterable[str]) -> list[Row]:
+    """Rows of a table that was begun, if it is this one.
+
+    **Raises:** `ValueError` naming the file and in which of `same` its header differs.
+    """
     known = json.loads(file.read_text(encoding="utf-8"))
     other = [
         f"{name} {known['header'].get(name)!r} (now {header[name]!r})"

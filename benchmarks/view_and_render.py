@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from search_problems import print_rows
 
 import xavatar_jax as xa
 from xavatar_jax.geometry import closest_points
@@ -29,6 +30,7 @@ from xavatar_jax.render import (
     turntable,
     weight_colors,
 )
+from xavatar_jax.report import describe_machine, write_json
 
 
 def clock(work: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
@@ -42,35 +44,33 @@ def clock(work: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
     return min(t[0] for t in times), min(t[1] for t in times)
 
 
-def tell(name: str, seconds: tuple[float, float]) -> None:
-    print(f"{name}: {1000 * seconds[0]:.0f} ms, {1000 * seconds[1]:.0f} ms of processor time")
+def row(what: str, seconds: float, processor: float | None = None) -> dict[str, Any]:
+    return {"what": what, "seconds": seconds, "processor_s": processor}
 
 
-def measure_pictures(mesh: xa.Mesh) -> None:
+def picture_rows(mesh: xa.Mesh) -> list[dict[str, Any]]:
     """Pictures of one mesh: normals, rays and shadows are computed anew for each."""
-    bare = replace(mesh, normals=None)
+    bare, rows = replace(mesh, normals=None), []
     for name, size, ground in (
         ("512 x 512", (512, 512), False),
         ("512 x 512 with ground", (512, 512), True),
         ("1920 x 1080 with ground", (1920, 1080), True),
     ):
         camera = frame_view(mesh.vertices, "three_quarter", aspect=size[0] / size[1])
-        tell(
-            f"picture, {name}",
-            clock(lambda c=camera, s=size, g=ground: render_mesh(bare, c, s, ground=g)),
-        )
+        taken = clock(lambda c=camera, s=size, g=ground: render_mesh(bare, c, s, ground=g))
+        rows.append(row(f"picture, {name}", *taken))
     wall, processor = clock(lambda: turntable(bare, 8, (1920, 1080)), 2)
-    tell("turntable, 1920 x 1080, a picture of 8", (wall / 8, processor / 8))
+    return [*rows, row("turntable of 1920 x 1080, a picture of 8", wall / 8, processor / 8)]
 
 
-def measure_viewer(avatar: xa.Avatar, frames: xa.Frames) -> None:
+def viewer_rows(avatar: xa.Avatar, frames: xa.Frames) -> list[dict[str, Any]]:
     """From the call to the page, and from a slider to the new mesh on its way to the browser."""
     begun = time.perf_counter()
     with xa.view(avatar, frames=frames, verbose=False) as viewer:
         urllib.request.urlopen(viewer.url).read()
-        print(f"viewer: page after {time.perf_counter() - begun:.1f} s", end="")
+        page = time.perf_counter() - begun
         viewer.wait_until_shown()
-        print(f", avatar after {time.perf_counter() - begun:.1f} s")
+        shown = time.perf_counter() - begun
         joint = avatar.body.tree.index("left_elbow")
 
         def slide(degrees: list[float] = [0.0]) -> None:  # noqa: B006
@@ -80,7 +80,12 @@ def measure_viewer(avatar: xa.Avatar, frames: xa.Frames) -> None:
             while viewer.shown != wish:
                 time.sleep(0.001)
 
-        tell("viewer, slider to moved mesh", clock(slide, 20))
+        moved = clock(slide, 20)
+    return [
+        row("viewer, from the call to the page", page),
+        row("viewer, from the call to the avatar, whose surface is extracted and kept", shown),
+        row("viewer, from a slider to the moved mesh on its way to the browser", *moved),
+    ]
 
 
 def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> None:
@@ -94,11 +99,11 @@ def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> Non
         "weights": (replace(mesh, colors=weights), "error"),
         "error": (replace(mesh, colors=error_colors(1000 * distance, 2.0)), "error"),
     }
-    row = [
+    pictures = [
         render_mesh(shown, camera, (310, 500), shading=shading, base_color=SKIN_COLOR, ground=True)
         for shown, shading in ways.values()
     ]
-    sheet = grid_picture([[*row, color_bar(2.0, (70, 500))]], column_labels=[*ways, ""], gap=4)
+    sheet = grid_picture([[*pictures, color_bar(2.0, (70, 500))]], column_labels=[*ways, ""], gap=4)
     save_png(folder / "shadings.png", sheet)
     save_png(
         folder / "turntable.png",
@@ -111,16 +116,25 @@ def main() -> None:
     parser.add_argument("avatar", type=Path)
     parser.add_argument("--pictures", type=Path, help="folder to draw into")
     parser.add_argument("--no-viewer", action="store_true", help="measure pictures alone")
+    parser.add_argument("--json", help="write the figures to this file")
     options = parser.parse_args()
     avatar = xa.load_avatar(options.avatar)
     frames = xa.synthetic_capture(body=avatar.body).test.sequences["signs_and_piano"]
-    if not options.no_viewer:
-        measure_viewer(avatar, frames)
+    rows = [] if options.no_viewer else viewer_rows(avatar, frames)
     frame = frames[len(frames) // 2]
     mesh = avatar.animate(frame.params)[0].compute_normals()
     if options.pictures is not None:
         draw(avatar, frame, mesh, options.pictures)
-    measure_pictures(mesh)
+    rows = [*picture_rows(mesh), *rows]
+    print_rows(rows, ("what", "seconds", "processor_s"))
+    header = {
+        "question": "seconds of pictures and of the viewer",
+        **describe_machine(),
+        "vertices": mesh.num_vertices,
+    }
+    if options.json:
+        write_json(options.json, {"header": header, "rows": rows})
+        print(f"written: {options.json}")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 from helpers import COLUMNS, PARENTS, toy_arrays
+from toy_smplx import write_toy_body
 
 from xavatar_jax.body import load_body, synthetic_body
 
@@ -107,6 +108,13 @@ def family_paths(family_arrays, tmp_path_factory):
 def family(family_paths):
     """A loaded small body of each kind, float32."""
     return {kind: load_body(path) for kind, path in family_paths.items()}
+
+
+@pytest.fixture(scope="session")
+def toy_body(tmp_path_factory):
+    """A small body of capsules on SMPL-X's tree, read through the ordinary loader."""
+    path = write_toy_body(tmp_path_factory.mktemp("toy") / "SMPLX_NEUTRAL.npz")
+    return load_body(path, num_betas=10, num_expression=10)
 
 
 @pytest.fixture(scope="session")

@@ -3,8 +3,9 @@
     python docs/figures/update.py                                    # write the tables again
     python docs/figures/update.py --metrics out/fit_grab/metrics.json
     python docs/figures/update.py --part-aware part_aware.json
-    python docs/figures/update.py --animate animate.json
+    python docs/figures/update.py --animate animate.json --view view.json
     python docs/figures/update.py --correspondence search.json --gradients gradients.json
+    python docs/figures/update.py --borders borders.json
     python docs/figures/update.py --table1 table1.json --table2 table2.json --curve curve.json
 
 A result is copied into this folder without what is of no use elsewhere (paths, single frames).
@@ -32,10 +33,12 @@ TEXTS = (
     "docs/benchmarks.md",
     "docs/choose.md",
     "docs/options.md",
+    "docs/view-and-render.md",
 )
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
-ANIMATE = "animate.json"
+ANIMATE, VIEW = "animate.json", "view_and_render.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
+BORDERS = "part_borders.json"
 FLOOR = "metric_floor.json"
 MEMORY = "memory.json"
 TABLE1, TABLE2, CURVE = "table1_ablations.json", "table2_grab.json", "accuracy_over_time.json"
@@ -208,6 +211,28 @@ def export_view(record: dict[str, Any]) -> str:
     return f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['frames']} frames."
 
 
+def extraction_view(record: dict[str, Any]) -> str:
+    """The canonical surface at cells of some sizes."""
+    rows = [["cells, mm", "vertices", "s", "the first time, s", "rise of memory, MiB"]]
+    header = record["header"]
+    for row in header.get("extractions", ()):
+        cells = (f"{row['cell_mm']:g}", str(row["vertices"]), f"{row['seconds']:.1f}")
+        rows.append([*cells, f"{row['first_s']:.1f}", _number(row["rss_rise_mb"], 0)])
+    return f"{_table(rows)}\n\n{_sentence(_machine(header))}; preset `{header['preset']}`."
+
+
+def seconds_view(record: dict[str, Any]) -> str:
+    """What takes how long."""
+    rows = [["", "s", "of processor time, s"]]
+    for row in record["rows"]:
+        processor = row["processor_s"]
+        rows.append(
+            [row["what"], f"{row['seconds']:.2f}", "–" if processor is None else f"{processor:.2f}"]
+        )
+    header = record["header"]
+    return f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['vertices']} vertices."
+
+
 _PATHS = {
     ("plain", "mlp"): "network, plain path",
     ("batched", "mlp"): "network, batched",
@@ -303,6 +328,17 @@ def contact_view(record: dict[str, Any]) -> str:
     for row in _of_table(record, "contact"):
         name = _PATHS[row["path"], row["field"]]
         rows.append([row["case"], name, row["starts"], *_cells(row, _CONTACT_COLUMNS)])
+    return _with_run(rows, record)
+
+
+def borders_view(record: dict[str, Any]) -> str:
+    """Recall at borders of parts, by what is known of a point."""
+    rows = [["border", "degrees", "starts of", "points", "found", "starts a point"]]
+    for row in record["rows"]:
+        figures = (f"{row['recall']:.4f}", f"{row['starts_per_point']:.1f}")
+        rows.append(
+            [row["border"], f"{row['pose_deg']:g}", row["starts"], str(row["points"]), *figures]
+        )
     return _with_run(rows, record)
 
 
@@ -441,9 +477,13 @@ def _with_run(rows: list[list[str]], record: dict[str, Any]) -> str:
         return "Not part of a quick run."
     grid = ""
     if "grid_mm" in header:
-        spacing = (header["grid_mm"], header.get("guide_mm", header["grid_mm"]))
-        grid, guide = (", ".join(f"{value:g}" for value in mm) for mm in spacing)
-        grid = f", grid of {grid} mm and guide of {guide} mm (body, hands, face)"
+        spacing = {name: header.get(f"{name}_mm") for name in ("grid", "guide")}
+        sizes = [
+            f"{name} of {', '.join(f'{value:g}' for value in mm)} mm"
+            for name, mm in spacing.items()
+            if mm
+        ]
+        grid = f", {' and '.join(sizes)} (body, hands, face)"
     return (
         f"{_table(rows)}\n\n{_sentence(_machine(header))}; {size} run, seed {header['seed']}, "
         f"network fitted in {header['prefit_steps']} steps{grid}."
@@ -468,11 +508,14 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{PART_AWARE}": benchmark_view,
     f"docs/figures/{ANIMATE}": animate_view,
     f"docs/figures/{ANIMATE} export": export_view,
+    f"docs/figures/{ANIMATE} extraction": extraction_view,
+    f"docs/figures/{VIEW}": seconds_view,
     f"docs/figures/{SEARCH} 20": paths_view(20.0),
     f"docs/figures/{SEARCH} 40": paths_view(40.0),
     f"docs/figures/{SEARCH} batches": batches_view,
     f"docs/figures/{SEARCH} resolution": resolution_view,
     f"docs/figures/{SEARCH} contact": contact_view,
+    f"docs/figures/{BORDERS}": borders_view,
     f"docs/figures/{GRADIENTS} accuracy": accuracy_of_gradients_view,
     f"docs/figures/{GRADIENTS} float32": float32_view,
     f"docs/figures/{GRADIENTS} time": time_of_gradients_view,
@@ -535,8 +578,10 @@ _STORED = {
     "metrics": METRICS,
     "part_aware": PART_AWARE,
     "animate": ANIMATE,
+    "view": VIEW,
     "correspondence": SEARCH,
     "gradients": GRADIENTS,
+    "borders": BORDERS,
     "metric_floor": FLOOR,
     "memory": MEMORY,
     "table1": TABLE1,
@@ -551,8 +596,10 @@ def main() -> None:
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
     parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
     parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
+    parser.add_argument("--view", help="JSON of benchmarks/view_and_render.py")
     parser.add_argument("--correspondence", help="JSON of benchmarks/correspondence.py")
     parser.add_argument("--gradients", help="JSON of benchmarks/gradients.py")
+    parser.add_argument("--borders", help="JSON of benchmarks/part_borders.py")
     parser.add_argument("--metric-floor", help="JSON of benchmarks/metric_floor.py")
     parser.add_argument("--memory", help="JSON of benchmarks/memory.py")
     parser.add_argument("--table1", help="JSON of benchmarks/table1_ablations.py")

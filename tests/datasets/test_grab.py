@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
+from toy_smplx import write_toy_body
 
 from xavatar_jax.body import load_body, pose_body, with_template
 from xavatar_jax.datasets import find_gender, load_data, load_grab
@@ -207,8 +208,6 @@ def test_load_data_finds_grab(toy_body, split_folder):
 
 
 def test_a_body_named_otherwise_counts_as_the_gender_it_was_loaded_for(tmp_path, split_folder):
-    from toy_smplx import write_toy_body
-
     write_sequence(tmp_path / "f/train/a.npz", gender="male")
     write_sequence(tmp_path / "f/test/b.npz", gender="male")
     body = load_body(write_toy_body(tmp_path / "SMPLX_MALE.npz"), num_betas=10, num_expression=10)
