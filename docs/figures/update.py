@@ -474,7 +474,7 @@ def _with_run(rows: list[list[str]], record: dict[str, Any]) -> str:
     header = record["header"]
     size = "quick" if header["quick"] else "full"
     if len(rows) == 1:
-        return "Not part of a quick run."
+        return NOT_MEASURED
     grid = ""
     if "grid_mm" in header:
         spacing = {name: header.get(f"{name}_mm") for name in ("grid", "guide")}
