@@ -362,8 +362,9 @@ def batch_table(
             field, tables = getattr(fields, name), guides if path == "guided" else fields
             case = one_frame(body, vertices, field, transforms, count, seed)
             search = compiled(path, field, tables, table, case)
-            repeats = 1 if path == "batched" else size.repeats
-            row = fast_row(search, [case], tables, path, repeats)
+            # The fewer the points, the more a moment's load on the machine would weigh.
+            often = max(size.repeats, size.repeats * 100_000 // count)
+            row = fast_row(search, [case], tables, path, 1 if path == "batched" else often)
             label = {"path": path, "field": name, "starts": "part_aware", "pose_deg": 20.0}
             rows.append({"table": "batches", **label, **row})
             print_rows(rows[-1:], COLUMNS)
