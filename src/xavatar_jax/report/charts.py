@@ -41,11 +41,11 @@ def line_chart(
         axes.set_xscale("log")
     if x_ticks is not None:
         axes.set_xticks(x_ticks, [f"{x:,g}" if x < 1e6 else f"{x:,.0f}" for x in x_ticks])
-        axes.tick_params(axis="x", which="minor", bottom=False)
+        axes.set_xticks([], minor=True)
     axes.grid(alpha=0.3)
     axes.set_xlabel(x_label)
     axes.set_title(title)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=min(len(lines), 3), frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
