@@ -318,8 +318,8 @@ def float32_rows(field: Any, problems: list, count: int, seed: int, kept: dict) 
                 found = np.asarray(directional(fn, case, varied, mode)())
                 expected = kept["float64"][varied, mode]
                 # One vector for all points by reverse mode, the same that a training step takes.
-                rows_of = kept["regular"] if mode == "forward" else None
-                found, expected = found[rows_of], expected[rows_of]
+                chosen = kept["regular"] if mode == "forward" else None
+                found, expected = found[chosen], expected[chosen]
                 gap = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
                 rows.append(
                     {

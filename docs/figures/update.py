@@ -116,6 +116,14 @@ _EXPORT = (
     ("rig_mean_mm", "lost in all, mean, mm", 3),
     ("rig_max_mm", "the same, maximum", 1),
 )
+_EXTRACTION_COLUMNS = (
+    ("cell_mm", "cells, mm", 1),
+    ("vertices", "vertices", 0),
+    ("seconds", "s", 1),
+    ("first_s", "the first time, s", 1),
+    ("rss_rise_mb", "rise of memory, MiB", 0),
+)
+_SECONDS_COLUMNS = (("seconds", "s", 2), ("processor_s", "of processor time, s", 2))
 
 
 def slim_metrics(record: dict[str, Any]) -> dict[str, Any]:
@@ -213,22 +221,16 @@ def export_view(record: dict[str, Any]) -> str:
 
 def extraction_view(record: dict[str, Any]) -> str:
     """The canonical surface at cells of some sizes."""
-    rows = [["cells, mm", "vertices", "s", "the first time, s", "rise of memory, MiB"]]
     header = record["header"]
-    for row in header.get("extractions", ()):
-        cells = (f"{row['cell_mm']:g}", str(row["vertices"]), f"{row['seconds']:.1f}")
-        rows.append([*cells, f"{row['first_s']:.1f}", _number(row["rss_rise_mb"], 0)])
+    rows = [[label for _, label, _ in _EXTRACTION_COLUMNS]]
+    rows += [_cells(row, _EXTRACTION_COLUMNS) for row in header["extractions"]]
     return f"{_table(rows)}\n\n{_sentence(_machine(header))}; preset `{header['preset']}`."
 
 
 def seconds_view(record: dict[str, Any]) -> str:
     """What takes how long."""
-    rows = [["", "s", "of processor time, s"]]
-    for row in record["rows"]:
-        processor = row["processor_s"]
-        rows.append(
-            [row["what"], f"{row['seconds']:.2f}", "–" if processor is None else f"{processor:.2f}"]
-        )
+    rows = [["", *(label for _, label, _ in _SECONDS_COLUMNS)]]
+    rows += [[row["what"], *_cells(row, _SECONDS_COLUMNS)] for row in record["rows"]]
     header = record["header"]
     return f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['vertices']} vertices."
 
@@ -283,6 +285,12 @@ _CONTACT_COLUMNS = (
     ("inverted_roots_per_point", "inverted roots a point", 2),
     ("share_of_points_with_inverted_roots_too", "points with those too", 4),
 )
+_BORDER_COLUMNS = (
+    ("pose_deg", "degrees", 0),
+    ("points", "points", 0),
+    ("recall", "found", 4),
+    ("starts_per_point", "starts a point", 1),
+)
 
 
 def paths_view(degrees: float) -> Callable[[dict[str, Any]], str]:
@@ -333,12 +341,9 @@ def contact_view(record: dict[str, Any]) -> str:
 
 def borders_view(record: dict[str, Any]) -> str:
     """Recall at borders of parts, by what is known of a point."""
-    rows = [["border", "degrees", "starts of", "points", "found", "starts a point"]]
+    rows = [["border", "starts of", *(label for _, label, _ in _BORDER_COLUMNS)]]
     for row in record["rows"]:
-        figures = (f"{row['recall']:.4f}", f"{row['starts_per_point']:.1f}")
-        rows.append(
-            [row["border"], f"{row['pose_deg']:g}", row["starts"], str(row["points"]), *figures]
-        )
+        rows.append([row["border"], row["starts"], *_cells(row, _BORDER_COLUMNS)])
     return _with_run(rows, record)
 
 
@@ -362,8 +367,7 @@ def float32_view(record: dict[str, Any]) -> str:
     for row in _of_table(record, "float32"):
         names = ("relative_gap_max", "relative_gap_p99", "relative_gap_median")
         gaps = (f"{row[name]:.1e}" for name in names)
-        mode = row.get("mode", "forward")
-        rows.append([row["at"], row["by"], mode, *gaps, f"{row['share_below_1e-3']:.4f}"])
+        rows.append([row["at"], row["by"], row["mode"], *gaps, f"{row['share_below_1e-3']:.4f}"])
     return _with_run(rows, record)
 
 
