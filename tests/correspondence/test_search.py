@@ -34,6 +34,7 @@ from xavatar_jax.fields import (
     GridSpacing,
     build_part_grids,
     pose_grid,
+    skin_with_jacobian,
     tabulate,
 )
 
@@ -164,11 +165,15 @@ def test_a_polished_root_is_two_newton_steps_closer(x64):
     field, transforms = two_bone_arm(0.6)
     truth = np.array([[0.05, 0.02, -0.03]])
     x_d = jnp.asarray(arm_skin(truth, 0.6)[0])
-    point, weights, regular = implicit_root(jnp.asarray(truth[0] + 1e-4), x_d, field, transforms)
+    start = jnp.asarray(truth[0] + 1e-4)
+    posed, jacobian, _ = skin_with_jacobian(field, start, transforms)
+    nearer = start - np.linalg.solve(jacobian, posed - x_d)
+    assert np.linalg.norm(nearer - truth[0]) < 2e-6  # quadratic: 1e-4 squared times a curvature
+    point, weights, regular = implicit_root(start, x_d, field, transforms)
     assert bool(regular)
-    # Quadratic: 1e-4 squared times a curvature is below 2e-6, whence derivatives are taken.
     assert np.linalg.norm(point - truth[0]) < 1e-9
-    np.testing.assert_allclose(weights, field(jnp.asarray(truth[0])), atol=2e-5)
+    # Derivatives, and weights, are those after the first step.
+    np.testing.assert_allclose(weights, field(nearer), atol=1e-12)
 
 
 def test_where_the_map_folds_there_is_no_derivative(x64):
