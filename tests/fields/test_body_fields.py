@@ -102,8 +102,10 @@ def test_the_start_is_the_same_in_every_pose(bundled_body, vertices, geometry, r
     np.testing.assert_array_equal(run(points, geometry.condition(params)), zero)
 
 
-def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, geometry, rng):
-    loud = eqx.tree_at(
+@pytest.fixture
+def loud(geometry, rng):
+    """The field once it has learned to listen."""
+    return eqx.tree_at(
         lambda g: (g.pose_weights, g.expressive.table),
         geometry,
         tuple(
@@ -111,6 +113,23 @@ def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, ge
             for w in (geometry.pose_weights, geometry.expressive.table)
         ),
     )
+
+
+@pytest.mark.parametrize("smile", [0.0, 1.0])
+def test_what_is_audible_gives_the_same_logits(bundled_body, vertices, loud, rng, smile):
+    pose = np.zeros((55, 3))
+    pose[[4, 22, 30]] = rng.normal(size=(3, 3))
+    expression = smile * rng.normal(size=10)
+    full = loud.condition(BodyParams.create(bundled_body, pose=pose, expression=expression))
+    kept = loud.audible(full)
+    assert len(kept.joints) == 3
+    assert len(kept.expression) == 10 * smile
+    points = jnp.asarray(vertices[::100], jnp.float32)
+    run = jax.vmap(loud, in_axes=(0, None))
+    np.testing.assert_allclose(run(points, kept), run(points, full), atol=1e-5)
+
+
+def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, loud, rng):
     run = jax.jit(jax.vmap(loud, in_axes=(0, None)))
     joints, names = np.asarray(loud.joints), bundled_body.tree
     # Between nodes of the finest level a joint need not be inside: it is only a place to ask.
@@ -150,6 +169,10 @@ def test_expressions_are_read_trilinearly_and_fade_out(rng):
     found = jax.vmap(loud)(jnp.asarray(inside, jnp.float32))
     expected = np.einsum("nd,dek->nek", inside - middle, slope)
     np.testing.assert_allclose(found, expected, atol=1e-5)
+    expression = rng.normal(size=2)
+    nodes = loud.under(jnp.asarray(expression, jnp.float32))
+    heard = jax.vmap(lambda x: loud.read(nodes, x))(jnp.asarray(inside, jnp.float32))
+    np.testing.assert_allclose(heard, np.einsum("nek,e->nk", expected, expression), atol=1e-5)
     halfway = jnp.asarray([low[0] + 0.01, *middle[1:]], jnp.float32)
     edge = np.einsum("d,dek->ek", np.asarray(halfway) - middle, slope)
     np.testing.assert_allclose(loud(halfway), 0.5 * edge, atol=1e-5)

@@ -35,7 +35,6 @@ from ..training.pool import tabulate_for_search
 from .animate import Animation, MotionLike, Offsets, PosableBase, animate, posable_base
 from .pointwise import (
     batch_size,
-    gradients,
     in_batches,
     logits,
     padded_size,
@@ -277,17 +276,15 @@ class Avatar:
 
     def _extract_canonical(self, cell: CellSizes | float | None, max_vertices: int | None) -> Mesh:
         neutral = canonical_params(self.body, jnp.asarray(self.betas))
-        condition = self.fields.geometry.condition(neutral)
+        geometry = self.fields.geometry
+        condition = geometry.audible(geometry.condition(neutral))
 
         def field(points: np.ndarray) -> np.ndarray:
             return np.asarray(logits(self.fields, jnp.asarray(points), condition))
 
-        def gradient(points: np.ndarray) -> np.ndarray:
-            return np.asarray(gradients(self.fields, jnp.asarray(points), condition))
-
-        return self._extract(
-            field, gradient, self._canonical_vertices, cell, max_vertices, batch_size(self.config)
-        )
+        template, batch = self._canonical_vertices, batch_size(self.config)
+        steps = {"edge_steps": 1, "project_steps": 1}
+        return self._extract(field, template, cell, max_vertices, batch, **steps)
 
     def _extract_posed(
         self, params: BodyParams, cell: CellSizes | float | None, max_vertices: int | None
@@ -301,16 +298,17 @@ class Avatar:
             # Nowhere to be found is outside, by about the width of the learned step.
             return np.asarray(jnp.where(answer.found, answer.logit, -10.0))
 
-        return self._extract(field, None, template, cell, max_vertices, batch)
+        return self._extract(field, template, cell, max_vertices, batch)
 
     def _extract(
         self,
         field: Any,
-        gradient: Any,
         template: np.ndarray,
         cell: CellSizes | float | None,
         max_vertices: int | None,
         batch: int,
+        edge_steps: int = 2,
+        project_steps: int = 0,
     ) -> Mesh:
         sizes = CellSizes() if cell is None else cell
         if not isinstance(sizes, CellSizes):
@@ -325,12 +323,12 @@ class Avatar:
             field,
             np.stack([template.min(0) - margin, template.max(0) + margin]),
             cell=float(wanted.min()),
-            cell_at=cell_at,
+            cell_at=cell_at if np.ptp(wanted) > 0 else None,
             seeds=template,
-            gradient=gradient,
             batch_points=batch,
             max_vertices=max_vertices,
-            project_steps=1 if gradient is not None else 0,
+            edge_steps=edge_steps,
+            project_steps=project_steps,
         )
         return mesh.largest_component()
 

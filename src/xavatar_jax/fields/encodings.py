@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .grids import CORNERS, lerp_weights
+
 
 def positional_encoding(x: Float[Array, " n"], octaves: int) -> Float[Array, " m"]:
     """$[x, \\sin 2^0 x, \\cos 2^0 x, \\dots, \\cos 2^{L-1} x]$ with L `octaves`, raw input first.
@@ -21,7 +23,6 @@ def positional_encoding(x: Float[Array, " n"], octaves: int) -> Float[Array, " m
     return jnp.concatenate([x, waves.reshape(-1)])
 
 
-_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)
 # Large primes, one an axis, as in Instant NGP (Müller et al., SIGGRAPH 2022).
 _PRIMES = np.array([1, 2654435761, 805459861], np.uint32)
 
@@ -77,10 +78,9 @@ class HashEncoding(eqx.Module):
         u = (x - origin)[None, :] / spacing[:, None]
         cell = jnp.floor(jax.lax.stop_gradient(u))
         fraction = u - cell
-        corners = cell.astype(jnp.int32)[:, None, :] + _CORNERS  # (levels, 8, 3)
+        corners = cell.astype(jnp.int32)[:, None, :] + CORNERS  # (levels, 8, 3)
         rows = jnp.stack([self._rows(level, corners[level]) for level in range(len(self.spacing))])
-        lerp = jnp.where(_CORNERS == 1, fraction[:, None, :], 1 - fraction[:, None, :]).prod(-1)
-        return jnp.einsum("lc,lcf->lf", lerp, self.table[rows])
+        return jnp.einsum("lc,lcf->lf", lerp_weights(fraction), self.table[rows])
 
     def _rows(self, level: int, corners: Array) -> Array:
         shape, size, offset = self.shapes[level], self.sizes[level], self.offsets[level]

@@ -6,11 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+
+from .grids import CORNERS, lerp_weights
 
 # A box fades out over its last centimetres, so that the field has no edge there.
 _FADE_M = 0.02
-_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)
+_EXACT = jax.lax.Precision.HIGHEST
 
 
 class ExpressionGrid(eqx.Module):
@@ -40,13 +42,25 @@ class ExpressionGrid(eqx.Module):
         self.table = jnp.zeros((x * y * z, num_expression, features))
 
     def __call__(self, x: Float[Array, "3"]) -> Float[Array, "E K"]:
+        rows, share = self._around(x)
+        return jnp.einsum("c,cek->ek", share, self.table[rows])
+
+    def under(self, expression: Float[Array, " E"]) -> Float[Array, "N K"]:
+        """The nodes' features under one expression, for `read`."""
+        return jnp.einsum("nek,e->nk", self.table, expression, precision=_EXACT)
+
+    def read(self, nodes: Float[Array, "N K"], x: Float[Array, "3"]) -> Float[Array, " K"]:
+        """Features of a point under the expression of `nodes`."""
+        rows, share = self._around(x)
+        return share @ nodes[rows]
+
+    def _around(self, x: Float[Array, "3"]) -> tuple[Int[Array, "8"], Float[Array, "8"]]:
+        """The nodes of a point's cell, and the share of each: all zero outside the box."""
         u = (x - jnp.asarray(self.low, x.dtype)) / self.spacing
         last = jnp.asarray(self.shape, x.dtype) - 1
         depth = self.spacing * jnp.minimum(u, last - u).min()
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(u)), 0, last - 1)
         fraction = jnp.clip(u - cell, 0, 1)
-        corners = cell.astype(jnp.int32) + _CORNERS
+        corners = cell.astype(jnp.int32) + CORNERS
         rows = (corners[:, 0] * self.shape[1] + corners[:, 1]) * self.shape[2] + corners[:, 2]
-        share = jnp.where(_CORNERS == 1, fraction, 1 - fraction).prod(-1)
-        share = share * jnp.clip(depth / _FADE_M, 0, 1)
-        return jnp.einsum("c,cek->ek", share, self.table[rows])
+        return rows, lerp_weights(fraction) * jnp.clip(depth / _FADE_M, 0, 1)

@@ -9,8 +9,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
+
+from .softplus import softplus
 
 _BATCH = 4096
 _EXACT = jax.lax.Precision.HIGHEST
@@ -53,32 +54,16 @@ class FixedHash(AbstractFixedPoints):
     sharpness: float = eqx.field(static=True)
 
     def __call__(self, condition: Any) -> Float[Array, " N"]:
-        joints, expression = condition
+        joints, expression = condition.joints, condition.expression
         weight, width = self.from_condition, joints.shape[-1]
         h = self.first + _matmul(self.nearness, _matmul(joints, weight[:, :width].T))
         if self.expressive is not None:
             heard = jnp.einsum("nek,e->nk", self.expressive, expression, precision=_EXACT)
             h = h + _matmul(heard, weight[:, width:].T)
         for weight, bias in zip(self.hidden, self.biases, strict=True):
-            h = _matmul(_softplus(h, self.sharpness), weight.T) + bias
+            h = _matmul(softplus(h, self.sharpness), weight.T) + bias
         return h[:, 0]
 
 
 def _matmul(a: Array, b: Array) -> Array:
     return jnp.matmul(a, b, precision=_EXACT)
-
-
-# log(1 + u) for u from 0 to 1, to 6e-9: three times as fast as the library's own.
-_LOG1P = (
-    np.polynomial.chebyshev.Chebyshev.interpolate(np.log1p, 9, [0, 1])
-    .convert(kind=np.polynomial.Polynomial)
-    .coef
-)
-
-
-def _softplus(x: Array, sharpness: float) -> Array:
-    u = jnp.exp(-sharpness * jnp.abs(x))
-    log = jnp.full_like(u, _LOG1P[-1])
-    for coefficient in _LOG1P[-2::-1]:
-        log = log * u + jnp.asarray(coefficient, u.dtype)
-    return jnp.maximum(x, 0) + log / sharpness

@@ -18,6 +18,7 @@ from .encodings import HashEncoding
 from .expression import ExpressionGrid
 from .fixed import AbstractFixedPoints, FixedHash, FixedPoints
 from .mlp import ImplicitMLP, MLPShape
+from .softplus import softplus
 
 
 class AbstractGeometryField(eqx.Module):
@@ -34,6 +35,13 @@ class AbstractGeometryField(eqx.Module):
     def at(self, points: Float[Array, "N 3"]) -> AbstractFixedPoints:
         """The field at points that stay, for many conditions: what can be kept is kept."""
         return FixedPoints(self, points)
+
+    def audible(self, condition: Any) -> Any:
+        """A condition without what is silent in it: the same logits, sooner.
+
+        For many points under one known condition; it cannot be traced.
+        """
+        return condition
 
 
 class MLPGeometry(AbstractGeometryField):
@@ -69,9 +77,16 @@ class MLPGeometry(AbstractGeometryField):
 
 
 class LocalCondition(NamedTuple):
-    """Features of each joint's rotation `(J, K)`, and expression coefficients `(E,)`."""
+    """One frame as a `HashGeometry` hears it.
+
+    - `joints`: features of each joint's rotation, heard around `centres` (metres) and fading with
+      the squared distance by `fade`.
+    - `expression`: coefficients; none of them: silence.
+    """
 
     joints: Float[Array, "J K"]
+    centres: Float[Array, "J 3"]
+    fade: Float[Array, " J"]
     expression: Float[Array, " E"]
 
 
@@ -146,7 +161,8 @@ class HashGeometry(AbstractGeometryField):
         # A motion may have fewer coefficients than the person's capture had, or more.
         known = 0 if self.expressive is None else self.expressive.table.shape[1]
         given = params.expression[:known]
-        return LocalCondition(rows, jnp.pad(given, (0, known - len(given))))
+        expression = jnp.pad(given, (0, known - len(given)))
+        return LocalCondition(rows, *self._around_joints(rows.dtype), expression)
 
     def at(self, points: Float[Array, "N 3"]) -> FixedHash:
         features = jax.vmap(self._features)(points)
@@ -155,7 +171,7 @@ class HashGeometry(AbstractGeometryField):
         first = jnp.matmul(features, weight[:, :width].T, precision=jax.lax.Precision.HIGHEST)
         return FixedHash(
             first=first + bias,
-            nearness=jax.vmap(self._nearness)(points),
+            nearness=jax.vmap(lambda x: _nearness(x, *self._around_joints(x.dtype)))(points),
             expressive=None if self.expressive is None else jax.vmap(self.expressive)(points),
             from_condition=weight[:, width:],
             hidden=self.hidden[1:],
@@ -163,25 +179,39 @@ class HashGeometry(AbstractGeometryField):
             sharpness=self.sharpness,
         )
 
+    def audible(self, condition: LocalCondition) -> LocalCondition:
+        # Rows are zero for joints at rest, and coefficients for a neutral face.
+        heard = np.flatnonzero(np.asarray(condition.joints).any(axis=1))
+        speaks = np.asarray(condition.expression).any()
+        return LocalCondition(
+            condition.joints[heard],
+            condition.centres[heard],
+            condition.fade[heard],
+            condition.expression if speaks else condition.expression[:0],
+        )
+
     def __call__(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, ""]:
-        h = [self._features(x_c), self._nearness(x_c) @ condition.joints]
-        if self.expressive is not None:
-            h.append(condition.expression @ self.expressive(x_c))
+        joints, centres, fade, expression = condition
+        h = [self._features(x_c), _nearness(x_c, centres, fade) @ joints]
+        if self.expressive is not None and len(expression):
+            # Under `vmap` over points the nodes are summed once, not for each of them.
+            nodes = self.expressive.under(expression)
+            h.append(self.expressive.read(nodes, x_c))
         h = jnp.concatenate(h)
         last = len(self.hidden) - 1
         for k, (weight, bias) in enumerate(zip(self.hidden, self.biases, strict=True)):
-            h = weight @ h + bias
+            h = weight[:, : len(h)] @ h + bias  # narrower, where expression is silent
             if k < last:
-                h = jax.nn.softplus(self.sharpness * h) / self.sharpness
+                h = softplus(h, self.sharpness)
         return h[0]
 
     def _features(self, x: Float[Array, "3"]) -> Float[Array, " width"]:
         return (self.encoding(x) * self._level_mask(x)[:, None]).reshape(-1)
 
-    def _nearness(self, x: Float[Array, "3"]) -> Float[Array, " J"]:
-        """How much of each joint's condition is heard at `x`: a Gaussian of the distance."""
-        away = x - jax.lax.stop_gradient(self.joints).astype(x.dtype)
-        return jnp.exp(-0.5 * (away**2).sum(-1) / jnp.asarray(self.reach, x.dtype) ** 2)
+    def _around_joints(self, dtype: Any) -> tuple[Float[Array, "J 3"], Float[Array, " J"]]:
+        """Where each joint's condition is heard, and how it fades: see `_nearness`."""
+        fade = jnp.asarray(-0.5 / np.asarray(self.reach) ** 2, dtype)
+        return jax.lax.stop_gradient(self.joints).astype(dtype), fade
 
     def _level_mask(self, x: Float[Array, "3"]) -> Float[Array, " levels"]:
         """1 for levels heard at `x`, falling to 0 over the last two centimetres of a box."""
@@ -194,6 +224,15 @@ class HashGeometry(AbstractGeometryField):
             inside = jnp.clip(depth / 0.02, 0, 1)
             mask = jnp.maximum(mask, inside * jnp.asarray(spacing >= finest * 0.999, x.dtype))
         return mask
+
+
+def _nearness(
+    x: Float[Array, "3"], centres: Float[Array, "J 3"], fade: Float[Array, " J"]
+) -> Float[Array, " J"]:
+    """How much of each joint's condition is heard at `x`: a Gaussian of the distance."""
+    # By axis: compiled for a CPU, a sum over three is a loop for each joint.
+    u, v, w = x[:, None] - centres.astype(x.dtype).T
+    return jnp.exp((u * u + v * v + w * w) * fade.astype(x.dtype))
 
 
 @partial(jax.jit, static_argnums=(1, 2))
