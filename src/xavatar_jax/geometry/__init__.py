@@ -11,4 +11,5 @@ from .surface import enclosed_volume as enclosed_volume
 from .surface import face_areas as face_areas
 from .surface import face_normals as face_normals
 from .surface import sample_surface as sample_surface
+from .surface import sum_at_vertices as sum_at_vertices
 from .surface import vertex_normals as vertex_normals

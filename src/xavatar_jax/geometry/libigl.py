@@ -99,3 +99,22 @@ def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> 
         ValueError: if the mesh is empty, or an array is misshapen or not finite.
     """
     return ClosestPointTree(vertices, faces).query(points)
+
+
+def doubled_areas(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F"]:
+    """Twice the area of each triangle of a checked mesh."""
+    import igl
+
+    return igl.doublearea(vertices, faces)
+
+
+def area_weighted_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Unit normals at the vertices of a checked mesh; zero where no triangle has an area."""
+    import igl
+
+    weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA
+    return np.nan_to_num(igl.per_vertex_normals(vertices, faces, weighting))

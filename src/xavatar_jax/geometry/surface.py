@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from ._check import check_mesh
+from .libigl import area_weighted_normals, doubled_areas
 
 
 def _doubled_area_vectors(
@@ -27,7 +28,7 @@ def face_areas(vertices: ArrayLike, faces: ArrayLike) -> Float[np.ndarray, "F"]:
     Raises:
         ValueError: if the mesh is empty, misshapen or not finite.
     """
-    return 0.5 * np.linalg.norm(_doubled_area_vectors(*check_mesh(vertices, faces)), axis=1)
+    return doubled_areas(*check_mesh(vertices, faces)) / 2
 
 
 def face_normals(vertices: ArrayLike, faces: ArrayLike) -> Float[np.ndarray, "F 3"]:
@@ -45,14 +46,19 @@ def vertex_normals(vertices: ArrayLike, faces: ArrayLike) -> Float[np.ndarray, "
     Raises:
         ValueError: if the mesh is empty, misshapen or not finite.
     """
-    checked, index = check_mesh(vertices, faces)
-    vectors = _doubled_area_vectors(checked, index)
-    corners = index.reshape(-1)
-    sums = [
-        np.bincount(corners, np.repeat(vectors[:, axis], 3), minlength=len(checked))
-        for axis in range(3)
-    ]
-    return _normalised(np.stack(sums, axis=1))
+    return area_weighted_normals(*check_mesh(vertices, faces))
+
+
+def sum_at_vertices(
+    values: Float[np.ndarray, "F K"], faces: Int[np.ndarray, "F 3"], count: int
+) -> Float[np.ndarray, "V K"]:
+    """Sum over the faces at each of `count` vertices."""
+    from scipy.sparse import csc_matrix
+
+    # Column by column, where each face's three ones are.
+    ones = np.ones(faces.size, dtype=values.dtype)
+    starts = np.arange(0, faces.size + 1, 3)
+    return csc_matrix((ones, faces.reshape(-1), starts), shape=(count, len(faces))) @ values
 
 
 def enclosed_volume(vertices: ArrayLike, faces: ArrayLike) -> float:

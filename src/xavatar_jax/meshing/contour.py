@@ -9,6 +9,8 @@ by them.
 Source: Schaefer and Warren 2004, "Dual marching cubes: primal contouring of dual grids".
 """
 
+from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +19,9 @@ from jaxtyping import Float, Int
 from .cube_table import MAX_SIDES, cube_table
 from .octree import Octree
 
-_AROUND = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=np.int64) - 1
+_AROUND = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=np.int32) - 1
+# Dual cubes at a time: what bounds the memory.
+_BLOCK = 1 << 15
 
 
 class Polygons(NamedTuple):
@@ -35,56 +39,101 @@ class Polygons(NamedTuple):
 
 
 def dual_polygons(tree: Octree, pairs: Int[np.ndarray, "K 2"]) -> Polygons:
-    """Polygons of the surface between the leaf `pairs` of opposite sign."""
+    """Polygons of the surface between the leaf `pairs` of opposite sign, finer leaf first."""
+    inside = tree.value > 0
+    axis, above = _touching(tree, pairs)
+    # A vertex is found by its finer leaf (the first in number, of two alike) and the face there.
+    vertex_at = np.full((len(tree.level), 6), -1, dtype=np.int32)
+    vertex_at[pairs[:, 0], 2 * axis + ~above] = np.arange(len(pairs))
+    places = _corners_between(tree, pairs, axis, above)
+    with ThreadPoolExecutor(2) as pool:
+        blocks = pool.map(
+            lambda start: _polygons_at(tree, inside, vertex_at, places[start : start + _BLOCK]),
+            range(0, len(places), _BLOCK),
+        )
+        corners, sides = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    used = np.zeros(len(pairs) + 1, dtype=bool)
+    used[corners] = True
+    used[-1] = False  # what pads the rows
+    number = np.where(used, np.cumsum(used, dtype=np.int32) - 1, np.int32(-1))
+    pairs = pairs[used[:-1]]
+    leaves = np.where(inside[pairs[:, :1]], pairs, pairs[:, ::-1])
+    return Polygons(leaves, number[corners], sides)
+
+
+def _touching(tree: Octree, pairs: Int[np.ndarray, "K 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """The axis along which two leaves touch, and whether the second one lies above (K,)."""
+    low, other_low = tree.corner[pairs[:, 0]], tree.corner[pairs[:, 1]]
+    size, other_size = (1 << tree.level[pairs].astype(np.int32)).T
+    above = other_low == low + size[:, None]
+    axis = np.argmax(above | (other_low + other_size[:, None] == low), axis=1)
+    return axis, above.any(axis=1)
+
+
+def _corners_between(
+    tree: Octree, pairs: Int[np.ndarray, "K 2"], axis: np.ndarray, above: np.ndarray
+) -> Int[np.ndarray, "N"]:
+    """The corners of the faces between leaves of opposite sign, each once, by flat index.
+
+    Every dual cube with two signs has its middle at one of them.
+    """
+    size = 1 << tree.level[pairs[:, 0]].astype(np.int64)
+    strides = _strides(tree)
+    first = tree.corner[pairs[:, 0]] @ strides + above * size * strides[axis]
+    u, v = strides[(axis + 1) % 3] * size, strides[(axis + 2) % 3] * size
+    ordered = np.sort(np.concatenate([first, first + u, first + v, first + u + v]))
+    return ordered[np.append(True, ordered[1:] != ordered[:-1])]
+
+
+def _strides(tree: Octree) -> Int[np.ndarray, "3"]:
+    """What a step along each axis adds to the flat index of a lattice point."""
+    _, y, z = (tree.shape.astype(np.int64) << tree.depth) + 1
+    return np.array([y * z, z, 1])
+
+
+def _polygons_at(
+    tree: Octree,
+    inside: np.ndarray,
+    vertex_at: Int[np.ndarray, "L 6"],
+    places: Int[np.ndarray, "N"],
+) -> tuple[Int[np.ndarray, "P 12"], Int[np.ndarray, "P"]]:
+    """Polygons in the dual cubes around lattice points: vertices, padded by -1, and how many."""
     table = cube_table()
-    around = _leaves_around(tree, np.unique(pairs))
-    pattern = ((tree.value[around] > 0) << np.arange(8)).sum(axis=1)
+    strides = _strides(tree)
+    rows, rest = np.divmod(places, strides[0])
+    lattice = np.stack([rows, *np.divmod(rest, strides[1])], axis=1).astype(np.int32)
+    around = tree.locate((lattice[:, None] + _AROUND).reshape(-1, 3)).reshape(-1, 8)
+    pattern = np.packbits(inside[around], axis=1, bitorder="little")[:, 0]
     rows = np.flatnonzero(table.count[pattern])
     edges = table.polygons[pattern[rows]]
     drawn = edges[:, :, 0] >= 0
     cube = np.broadcast_to(rows[:, None], drawn.shape)[drawn]
     edges = edges[drawn]
-
-    ends = around[cube[:, None, None], table.edges[edges]]
-    inside = tree.value[ends[..., 0]] > 0
-    first = np.where(inside, ends[..., 0], ends[..., 1])
-    second = np.where(inside, ends[..., 1], ends[..., 0])
-    key = np.where(edges >= 0, first * len(tree.level) + second, -1)
-    key, sides = _drop_repeats(key)
-    key, sides = key[sides >= 3], sides[sides >= 3]
-    names, corners = np.unique(key, return_inverse=True)
-    corners = corners.reshape(key.shape)
-    if len(names) and names[0] < 0:
-        names, corners = names[1:], corners - 1
-    leaves = np.stack(np.divmod(names, len(tree.level)), axis=1)
-    return Polygons(leaves, corners, sides)
-
-
-def _leaves_around(tree: Octree, leaves: Int[np.ndarray, "M"]) -> Int[np.ndarray, "N 8"]:
-    """The eight leaves around each lattice corner of `leaves`, each lattice corner once."""
-    size = 1 << tree.level[leaves].astype(np.int64)
-    corner = tree.corner[leaves].astype(np.int64)[:, None] + size[:, None, None] * (_AROUND + 1)
-    extent = (tree.shape << tree.depth) + 1
-    flat = (corner[..., 0] * extent[1] + corner[..., 1]) * extent[2] + corner[..., 2]
-    flat = np.unique(flat)
-    lattice = np.stack(
-        [flat // (extent[1] * extent[2]), flat // extent[2] % extent[1], flat % extent[2]], axis=1
-    )
-    found = tree.locate((lattice[:, None] + _AROUND).reshape(-1, 3))
-    return found.reshape(-1, 8).astype(np.int64)
+    low, high = np.moveaxis(around[cube[:, None, None], table.edges[edges]], -1, 0)
+    size, other = tree.level[low], tree.level[high]
+    first = (size < other) | ((size == other) & (low < high))
+    face = 2 * (edges // 4) + ~first
+    vertices = vertex_at[np.where(first, low, high), face]
+    return _drop_repeats(np.where(edges >= 0, vertices, -1))
 
 
 def _drop_repeats(
-    key: Int[np.ndarray, "P 12"],
+    corners: Int[np.ndarray, "P 12"],
 ) -> tuple[Int[np.ndarray, "P 12"], Int[np.ndarray, "P"]]:
-    """Merge neighbouring equal corners of each polygon; they come from leaves seen twice."""
-    sides = (key >= 0).sum(axis=1)
-    column = np.arange(MAX_SIDES)
-    previous = np.where(column == 0, sides[:, None] - 1, column - 1)
-    keep = (key >= 0) & (key != np.take_along_axis(key, previous, axis=1))
-    order = np.argsort(~keep, axis=1, kind="stable")
-    key = np.take_along_axis(np.where(keep, key, -1), order, axis=1)
-    return key, keep.sum(axis=1)
+    """Merge neighbouring equal corners of each polygon; they come from leaves seen twice.
+
+    Polygons with less than three corners left are dropped.
+    """
+    sides = (corners >= 0).sum(axis=1)
+    previous = np.roll(corners, 1, axis=1)
+    previous[:, 0] = corners[np.arange(len(corners)), sides - 1]
+    repeated = (corners >= 0) & (corners == previous)
+    rows = np.flatnonzero(repeated.any(axis=1))
+    kept = np.where(repeated[rows], -1, corners[rows])
+    order = np.argsort(kept < 0, axis=1, kind="stable")
+    corners[rows] = np.take_along_axis(kept, order, axis=1)
+    sides = sides - repeated.sum(axis=1)
+    return corners[sides >= 3], sides[sides >= 3]
 
 
 def triangulate(
@@ -128,11 +177,13 @@ def _fans(
         corners = polygons.corners[which, :sides]
         if sides > 3:
             at = positions[corners]
-            length = np.linalg.norm(at[:, :, None] - at[:, None], axis=-1)
-            # A corner's two polygon edges stay: only what is left of each row is diagonals.
-            step = np.abs(np.subtract.outer(np.arange(sides), np.arange(sides)))
-            diagonal = (step > 1) & (step < sides - 1)
-            start = (length * diagonal).sum(axis=2).argmin(axis=1)
+            length = np.zeros(corners.shape)
+            for i, j in combinations(range(sides), 2):
+                if 1 < j - i < sides - 1:
+                    diagonal = np.linalg.norm(at[:, i] - at[:, j], axis=1)
+                    length[:, i] += diagonal
+                    length[:, j] += diagonal
+            start = length.argmin(axis=1)
             turned = (start[:, None] + np.arange(sides)) % sides
             corners = np.take_along_axis(corners, turned, axis=1)
         for i in range(1, sides - 1):
@@ -143,7 +194,9 @@ def _fans(
 
 def _on_crowded_edge(faces: Int[np.ndarray, "F 3"]) -> np.ndarray:
     """Whether each face has an edge that more than two faces share, (F,) bool."""
-    ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], axis=-1), axis=-1).astype(np.int64)
-    key = ends[..., 0] * (faces.max() + 1) + ends[..., 1]
-    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
-    return np.any(count[inverse.reshape(key.shape)] > 2, axis=1)
+    following = faces[:, [1, 2, 0]]
+    key = np.minimum(faces, following).astype(np.int64) * (faces.max() + 1)
+    key += np.maximum(faces, following)
+    ordered = np.sort(key, axis=None)
+    crowded = np.unique(ordered[2:][ordered[2:] == ordered[:-2]])
+    return np.isin(key, crowded).any(axis=1) if len(crowded) else np.zeros(len(faces), bool)

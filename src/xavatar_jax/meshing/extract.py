@@ -55,8 +55,8 @@ def extract_surface(
             until the first grid has at most 100,000 points.
         seeds: points (S, 3) near the surface, such as a template's vertices, around which cells
             are refined to twice their final size in any case.
-        gradient: batched gradient of the field, (batch_points, 3) to (batch_points, 3). Default:
-            finite differences, four evaluations a gradient.
+        gradient: batched gradient of the field, (batch_points, 3) to (batch_points, 3), for
+            `normals`. Default: finite differences, four evaluations a gradient.
         batch_points: rows in every call of `field` and `gradient`.
         max_vertices: if more vertices would come out, all cells grow by what is needed.
         edge_steps: evaluations that place each vertex on its edge of the dual grid.
@@ -180,7 +180,7 @@ def _contoured(
 ) -> Mesh:
     """Vertices and triangles of the surface between the leaf pairs."""
     polygons = dual_polygons(tree, pairs)
-    positions, values = place_between(tree, sampler, polygons.leaves, edge_steps)
+    positions, values, falls = place_between(tree, sampler, polygons.leaves, edge_steps)
     sizes = tree.sizes(polygons.leaves.reshape(-1)).reshape(-1, 2).min(axis=1)
     faces, crowded = triangulate(polygons, positions)
     if len(crowded):
@@ -189,8 +189,9 @@ def _contoured(
         middle = (positions[corners] * used).sum(axis=1) / used.sum(axis=1)
         positions = np.concatenate([positions, middle])
         values = np.concatenate([values, sampler(middle)])
+        falls = np.concatenate([falls, falls[corners[:, 0]]])
         sizes = np.concatenate([sizes, sizes[corners[:, 0]]])
-    positions = spread_and_project(sampler, positions, values, sizes, faces, project_steps)
+    positions = spread_and_project(sampler, positions, values, falls, sizes, faces, project_steps)
     positions = np.clip(positions, *sampler.bounds)
     mesh = Mesh(positions.astype(np.float32), faces)
     if not normals:

@@ -1,7 +1,8 @@
 """An octree refined where a field changes sign, sampled at the centres of its leaves."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,8 +10,12 @@ from jaxtyping import Bool, Float, Int
 from .sampler import FieldSampler
 
 _OCTANTS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=np.int32)
+_NUMBERS = np.arange(8, dtype=np.int32)
 _AXES = np.repeat(np.arange(3), 2)
 _SIDES = np.tile([1, 0], 3)
+
+# Nodes, a face of each, and the nodes across it: three arrays of one length.
+Meeting = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass
@@ -45,23 +50,32 @@ class Octree:
 
     def centres(self, nodes: Int[np.ndarray, "M"] | slice) -> Float[np.ndarray, "M 3"]:
         """Centres of nodes, metres."""
-        half = 0.5 * (1 << self.level[nodes].astype(np.int64))
-        return self.origin + self.cell * (self.corner[nodes] + half[:, None])
+        centres = self.corner[nodes].astype(np.float64)
+        centres += 0.5 * (1 << self.level[nodes].astype(np.int32))[:, None]
+        centres *= self.cell
+        centres += self.origin
+        return centres
 
     def sizes(self, nodes: Int[np.ndarray, "M"]) -> Float[np.ndarray, "M"]:
         """Edges of nodes, metres."""
         return self.cell * (1 << self.level[nodes].astype(np.int64))
 
-    def locate(self, lattice: Int[np.ndarray, "M 3"]) -> Int[np.ndarray, "M"]:
-        """The leaf that holds each finest lattice cell; cells outside clamp to the border."""
-        lattice = np.clip(lattice, 0, (self.shape << self.depth) - 1)
+    def locate(
+        self, lattice: Int[np.ndarray, "M 3"], least: Int[np.ndarray, "M"] | int = 0
+    ) -> Int[np.ndarray, "M"]:
+        """The leaf that holds each finest lattice cell; cells outside clamp to the border.
+
+        Where the leaf is of a level below `least`, the node of that level is given.
+        """
+        lattice = np.clip(lattice, 0, ((self.shape << self.depth) - 1).astype(lattice.dtype))
         root = lattice >> self.depth
         node = (root[:, 0] * self.shape[1] + root[:, 1]) * self.shape[2] + root[:, 2]
+        node = node.astype(np.int32)
         for level in range(self.depth - 1, -1, -1):
             child = self.first_child[node]
             bits = lattice >> level & 1
             octant = bits[:, 0] << 2 | bits[:, 1] << 1 | bits[:, 2]
-            node = np.where(child >= 0, child + octant, node)
+            node = np.where((child >= 0) & (level >= least), child + octant, node)
         return node
 
     def split(self, nodes: Int[np.ndarray, "M"], sampler: FieldSampler) -> Int[np.ndarray, "M8"]:
@@ -74,7 +88,7 @@ class Octree:
         self.level = np.concatenate([self.level, level])
         children = np.arange(start, len(self.level), dtype=np.int32)
         self.first_child = np.concatenate([self.first_child, np.full_like(children, -1)])
-        self.value = np.concatenate([self.value, sampler(self.centres(children))])
+        self.value = np.concatenate([self.value, sampler(self.centres(slice(start, None)))])
         self.corner_signs = np.concatenate([self.corner_signs, self._children_signs(nodes)])
         return children
 
@@ -137,8 +151,7 @@ def refine(
 
     Returns the face-adjacent leaf pairs of opposite sign, finer leaf first: (K, 2).
     """
-    none = np.zeros(0, dtype=np.int64)
-    hanging_leaf, hanging_face, hanging_other = none, none, none
+    hanging_leaf = hanging_face = hanging_other = np.zeros(0, dtype=np.int64)
     pairs = np.zeros((0, 2), dtype=np.int64)
     wanted = np.full(len(tree.level), -1, dtype=np.int8)
     seed_cell = seed_level = None
@@ -146,34 +159,42 @@ def refine(
         seed_level = np.minimum(target_level(seeds) + 1, tree.depth)
         seed_cell, seed_level = _seed_cells(tree, seeds, seed_level)
     new = np.arange(len(tree.level))
+    meetings = _meetings_of_roots(tree)
     while True:
-        split = tree.first_child >= 0
+        split, inside = tree.first_child >= 0, tree.value > 0
         keep = ~split[hanging_leaf]
         stale = keep & split[hanging_other]
-        leaf = np.concatenate([np.repeat(new, 6), hanging_leaf[stale]])
-        face = np.concatenate([np.tile(np.arange(6), len(new)), hanging_face[stale]])
         keep &= ~stale
-        other = _across(tree, leaf, face)
-        coarser = tree.level[other] > tree.level[leaf]
-        hanging_leaf = np.concatenate([hanging_leaf[keep], leaf[coarser]])
-        hanging_face = np.concatenate([hanging_face[keep], face[coarser]])
-        hanging_other = np.concatenate([hanging_other[keep], other[coarser]])
-        # Seen from the finer side, or once if both are of one size.
-        once = coarser | ((tree.level[other] == tree.level[leaf]) & (leaf < other))
-        once &= (tree.value[leaf] > 0) != (tree.value[other] > 0)
-        pairs = pairs[~split[pairs].any(axis=1)]
-        pairs = np.concatenate([pairs, np.stack([leaf[once], other[once]], axis=1)])
+        again = hanging_leaf[stale], hanging_face[stale]
+        hanging = [(hanging_leaf[keep], hanging_face[keep], hanging_other[keep])]
+        crossings = [pairs[~(split[pairs[:, 0]] | split[pairs[:, 1]])]]
+        for leaf, face, other in chain(meetings, [(*again, _across(tree, *again))]):
+            own, level = tree.level[leaf], tree.level[other]
+            coarser = np.flatnonzero(level > own)
+            hanging.append((leaf[coarser], face[coarser], other[coarser]))
+            crossed = np.flatnonzero(inside[leaf] != inside[other])
+            leaf, other, own, level = leaf[crossed], other[crossed], own[crossed], level[crossed]
+            # Seen from the finer side, or once if both are of one size.
+            once = (level > own) | ((level == own) & (leaf < other) & ~split[other])
+            crossings.append(np.stack([leaf[once], other[once]], axis=1))
+        hanging_leaf, hanging_face, hanging_other = (
+            np.concatenate(parts) for parts in zip(*hanging, strict=True)
+        )
+        pairs = np.concatenate(crossings)
 
-        touched = np.unique(np.concatenate([pairs.reshape(-1), new[tree.crossed(new)]]))
+        touched = np.zeros(len(tree.level), dtype=bool)
+        touched[pairs] = True
+        touched[new[tree.crossed(new)]] = True
+        touched = np.flatnonzero(touched)
         unknown = touched[wanted[touched] < 0]
         wanted[unknown] = target_level(tree.centres(unknown))
-        flagged = [touched[tree.level[touched] > wanted[touched]]]
-        steep = tree.level[pairs[:, 1]] > tree.level[pairs[:, 0]] + 1
-        flagged.append(pairs[steep, 1])
+        flagged = np.zeros(len(tree.level), dtype=bool)
+        flagged[touched[tree.level[touched] > wanted[touched]]] = True
+        flagged[pairs[tree.level[pairs[:, 1]] > tree.level[pairs[:, 0]] + 1, 1]] = True
         if seed_cell is not None:
             at_seed = tree.locate(seed_cell)
-            flagged.append(at_seed[tree.level[at_seed] > seed_level])
-        flagged = np.unique(np.concatenate(flagged))
+            flagged[at_seed[tree.level[at_seed] > seed_level]] = True
+        flagged = np.flatnonzero(flagged)
         if len(flagged) == 0:
             return pairs
         if len(tree.level) + 8 * len(flagged) > max_leaves:
@@ -183,6 +204,36 @@ def refine(
             )
         new = tree.split(flagged, sampler)
         wanted = np.concatenate([wanted, np.full(len(new), -1, dtype=np.int8)])
+        meetings = _meetings_of_children(tree, flagged)
+
+
+def _meetings_of_roots(tree: Octree) -> Iterator[Meeting]:
+    """Roots, a face of each, and the roots across it."""
+    roots = np.arange(len(tree.level))
+    for face in range(6):
+        faces = np.full(len(roots), face, dtype=np.int8)
+        yield roots, faces, _across(tree, roots, faces)
+
+
+def _meetings_of_children(tree: Octree, parents: Int[np.ndarray, "M"]) -> Iterator[Meeting]:
+    """Children of nodes just split, a face of each, and what is across: no finer, or split itself.
+
+    Siblings meet once. Across a parent's face one look serves its four children there.
+    """
+    first = tree.first_child[parents]
+    level = tree.level[parents]
+    for face in range(6):
+        bit = np.int32(4 >> _AXES[face])
+        octants = _NUMBERS[(_NUMBERS & bit > 0) == (_SIDES[face] == 1)]
+        leaf = (first[:, None] + octants).reshape(-1)
+        faces = np.full(len(leaf), face, dtype=np.int8)
+        if _SIDES[face] == 0:  # from the lower side to the upper
+            yield leaf, faces - 1, leaf + bit
+        beyond = _across(tree, parents, faces[: len(parents)], level)
+        child = tree.first_child[beyond][:, None]
+        other = np.where(child >= 0, child + (octants ^ bit), beyond[:, None])
+        other = np.where((beyond == parents)[:, None], leaf.reshape(other.shape), other)
+        yield leaf, faces, other.reshape(-1)
 
 
 def _seed_cells(
@@ -205,11 +256,17 @@ def _signs(value: Float[np.ndarray, "M"]) -> Int[np.ndarray, "M"]:
 
 
 def _across(
-    tree: Octree, leaf: Int[np.ndarray, "M"], face: Int[np.ndarray, "M"]
+    tree: Octree,
+    leaf: Int[np.ndarray, "M"],
+    face: Int[np.ndarray, "M"],
+    least: Int[np.ndarray, "M"] | int = 0,
 ) -> Int[np.ndarray, "M"]:
-    """A leaf on the other side of a leaf's face: the leaf, if it is not finer."""
-    probe = tree.corner[leaf].astype(np.int64)
-    size = 1 << tree.level[leaf].astype(np.int64)
+    """The leaf on the other side of a leaf's face, or one of them; no finer than level `least`.
+
+    At the border it is the leaf itself.
+    """
+    probe = tree.corner[leaf]
+    size = 1 << tree.level[leaf].astype(np.int32)
     axis, side = _AXES[face], _SIDES[face]
     probe[np.arange(len(leaf)), axis] += np.where(side == 1, size, -1)
-    return tree.locate(probe)
+    return tree.locate(probe, least)

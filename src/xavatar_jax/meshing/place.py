@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..geometry import sum_at_vertices, vertex_normals
 from .octree import Octree
 from .sampler import FieldSampler
 
@@ -11,12 +12,13 @@ _MARGIN = 0.02
 
 def place_between(
     tree: Octree, sampler: FieldSampler, leaves: Int[np.ndarray, "V 2"], steps: int
-) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V"]]:
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V"], Float[np.ndarray, "V 3"]]:
     """Zeros of the field on the segments from inside leaf centres to outside ones.
 
     The first guess is linear; each of `steps` evaluations narrows the bracket by the Illinois
-    rule, so a vertex never leaves its segment. Returns positions (V, 3) and the values there
-    after the last evaluation (V,).
+    rule, so a vertex never leaves its segment. Returns positions (V, 3), the values there after
+    the last evaluation (V,; infinite without one), and how the field falls from end to end, value
+    a metre, along the segments (V, 3).
     """
     start, end = tree.centres(leaves[:, 0]), tree.centres(leaves[:, 1])
     low, high = np.zeros(len(leaves)), np.ones(len(leaves))
@@ -36,7 +38,9 @@ def place_between(
         last = side
         if step + 1 < steps:
             t = _secant(low, high, f_low, f_high)
-    return start + t[:, None] * (end - start), value
+    along = end - start
+    fall = (tree.value[leaves[:, 0]] - tree.value[leaves[:, 1]]) / (along**2).sum(axis=1)
+    return start + t[:, None] * along, value, fall[:, None] * along
 
 
 def _secant(low: np.ndarray, high: np.ndarray, f_low: np.ndarray, f_high: np.ndarray) -> np.ndarray:
@@ -49,36 +53,68 @@ def spread_and_project(
     sampler: FieldSampler,
     positions: Float[np.ndarray, "V 3"],
     values: Float[np.ndarray, "V"],
+    falls: Float[np.ndarray, "V 3"],
     sizes: Float[np.ndarray, "V"],
     faces: Int[np.ndarray, "F 3"],
     steps: int,
 ) -> Float[np.ndarray, "V 3"]:
     """Move vertices towards the middle of their neighbours along the surface, then on to it.
 
-    A vertex ends within `sizes` (its cell, metres) of where it started. A step is taken only if
-    it ends closer to the level set, measured in metres by value over gradient, than a hundredth
-    of the cell or than before.
+    The mesh itself says where its normals point, and `falls` (see `place_between`) how steep the
+    field is: a vertex goes back along its normal by secants, without a gradient of the field. It
+    ends within `sizes` (its cell, metres) of where it started. A step is taken only if it ends
+    closer to the level set than a hundredth of the cell or than before.
     """
     origin = positions
     for _ in range(steps):
-        gradient = sampler.gradient(positions, 0.05 * sizes)
-        squared = np.maximum((gradient**2).sum(axis=1), np.finfo(np.float32).tiny)
-        normal = gradient / np.sqrt(squared)[:, None]
-        towards = 0.6 * (_neighbour_mean(positions, faces) - positions)
+        normal = vertex_normals(positions, faces)
+        terms = _slope_terms(falls, normal)
+        mean = _neighbour_mean(np.concatenate([positions, terms], axis=1), faces)
+        above, below = (terms + mean[:, 3:]).T
+        slopes = np.maximum(above, np.finfo(np.float32).tiny) / np.maximum(below, 1e-6)
+        towards = 0.6 * (mean[:, :3] - positions)
         towards -= (towards * normal).sum(axis=1, keepdims=True) * normal
-        # First along the surface, then off the value that the old position had.
-        moved = positions + towards - (values / squared)[:, None] * gradient
+        # Values fall outwards, along the normal; the value that the old position had is undone too.
+        known = np.where(np.isfinite(values), values, 0.0)
+        moved = positions + towards + (known / slopes)[:, None] * normal
         moved = _within_reach(moved, positions, 0.5 * sizes)
-        # The gradient turns little over half a cell: a second one would not pay.
-        polished = moved - (sampler(moved) / squared)[:, None] * gradient
-        polished = _within_reach(polished, moved, 0.25 * sizes)
-        polished = _within_reach(polished, origin, 0.75 * sizes)
-        polished_value = sampler(polished)
-        tolerance = np.maximum(np.abs(values), 0.01 * sizes * np.sqrt(squared))
-        accept = (np.abs(polished_value) <= tolerance) & sampler.within(polished)
+        before = sampler(moved)
+        first = np.clip(before / slopes, -0.25 * sizes, 0.25 * sizes)
+        polished = _within_reach(moved + first[:, None] * normal, origin, 0.75 * sizes)
+        after = sampler(polished)
+        # The slope that was met takes a third step. It is checked where it is more than a touch.
+        slopes = np.clip(_ratio(before - after, first, slopes), 0.25 * slopes, 4 * slopes)
+        second = np.clip(after / slopes, -0.25 * sizes, 0.25 * sizes)
+        again = _within_reach(polished + second[:, None] * normal, origin, 0.75 * sizes)
+        take = np.abs(second) < 2e-3 * sizes
+        far = np.flatnonzero(~take)
+        value = sampler(again[far])
+        take[far] = np.abs(value) < np.abs(after[far])
+        after[far] = np.where(take[far], value, after[far])
+        polished = np.where(take[:, None], again, polished)
+        tolerance = np.maximum(np.abs(values), 0.01 * sizes * slopes)
+        accept = (np.abs(after) <= tolerance) & sampler.within(polished)
         positions = np.where(accept[:, None], polished, positions)
-        values = np.where(accept, polished_value, values)
+        values = np.where(accept, after, values)
     return positions
+
+
+def _slope_terms(
+    falls: Float[np.ndarray, "V 3"], normal: Float[np.ndarray, "V 3"]
+) -> Float[np.ndarray, "V 2"]:
+    """Above and below the line of a least-squares slope along the normals: their sums divide.
+
+    A segment nearly along the surface says little, and counts little.
+    """
+    squared = np.maximum((falls**2).sum(axis=1), np.finfo(np.float32).tiny)
+    along = np.abs((falls * normal).sum(axis=1))
+    return np.stack([along, along**2 / squared], axis=1)
+
+
+def _ratio(a: np.ndarray, b: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """`a / b`, and `other` where `b` is next to nothing."""
+    tiny = np.abs(b) < 1e-9
+    return np.where(tiny, other, a / np.where(tiny, 1.0, b))
 
 
 def _within_reach(
@@ -94,15 +130,13 @@ def _within_reach(
 
 
 def _neighbour_mean(
-    positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """Mean of each vertex's neighbours; itself if it has none."""
-    start = faces.reshape(-1)
-    count = np.bincount(start, minlength=len(positions))
+    values: Float[np.ndarray, "V K"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V K"]:
+    """Mean over each vertex's neighbours; its own if it has none."""
+    count = np.bincount(faces.reshape(-1), minlength=len(values))
     # Every neighbour appears twice on a closed mesh: once in each of the two faces of the edge.
-    ends = positions[faces[:, [1, 2, 0]].reshape(-1)] + positions[faces[:, [2, 0, 1]].reshape(-1)]
-    sums = np.stack(
-        [np.bincount(start, ends[:, axis], minlength=len(positions)) for axis in range(3)], axis=1
-    )
+    first, second, third = faces.T
+    of_faces = values[first] + values[second] + values[third]
+    sums = sum_at_vertices(of_faces, faces, len(values)) - count[:, None] * values
     mean = sums / np.maximum(2 * count, 1)[:, None]
-    return np.where(count[:, None] > 0, mean, positions)
+    return np.where(count[:, None] > 0, mean, values)

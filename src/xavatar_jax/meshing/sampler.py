@@ -67,7 +67,8 @@ class FieldSampler:
 
     def within(self, points: Float[np.ndarray, "N 3"]) -> np.ndarray:
         """Whether each point lies in the bounds, (N,) bool."""
-        return np.all((points >= self.bounds[0]) & (points <= self.bounds[1]), axis=1)
+        x, y, z = ((points >= self.bounds[0]) & (points <= self.bounds[1])).T
+        return x & y & z
 
     def gradient(
         self, points: Float[np.ndarray, "N 3"], step: Float[np.ndarray, "N"]
@@ -99,8 +100,8 @@ class FieldSampler:
             self.count += rows
             if self._bar is not None:
                 self._bar.update(rows)
-        bad = ~np.isfinite(results).all(axis=tuple(range(1, results.ndim)))
-        if bad.any():
+        if not np.isfinite(results).all():
+            bad = ~np.isfinite(results).all(axis=tuple(range(1, results.ndim)))
             first = np.asarray(points)[bad][0]
             raise ValueError(
                 f"the field is not finite at {int(bad.sum())} of {len(points)} points, first at "
