@@ -107,7 +107,7 @@ def doubled_areas(
     """Twice the area of each triangle of a checked mesh."""
     import igl
 
-    return igl.doublearea(vertices, faces)
+    return np.asarray(igl.doublearea(vertices, faces))
 
 
 def area_weighted_normals(

@@ -199,4 +199,6 @@ def _on_crowded_edge(faces: Int[np.ndarray, "F 3"]) -> np.ndarray:
     key += np.maximum(faces, following)
     ordered = np.sort(key, axis=None)
     crowded = np.unique(ordered[2:][ordered[2:] == ordered[:-2]])
-    return np.isin(key, crowded).any(axis=1) if len(crowded) else np.zeros(len(faces), bool)
+    if len(crowded) == 0:
+        return np.zeros(len(faces), dtype=bool)
+    return np.any(np.isin(key, crowded), axis=1)
