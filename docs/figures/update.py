@@ -117,7 +117,6 @@ _EXPORT = (
     ("rig_max_mm", "the same, maximum", 1),
 )
 _EXTRACTION_COLUMNS = (
-    ("cell_mm", "cells, mm", 1),
     ("vertices", "vertices", 0),
     ("seconds", "s", 1),
     ("first_s", "the first time, s", 1),
@@ -222,8 +221,8 @@ def export_view(record: dict[str, Any]) -> str:
 def extraction_view(record: dict[str, Any]) -> str:
     """The canonical surface at cells of some sizes."""
     header = record["header"]
-    rows = [[label for _, label, _ in _EXTRACTION_COLUMNS]]
-    rows += [_cells(row, _EXTRACTION_COLUMNS) for row in header["extractions"]]
+    rows = [["cells", *(label for _, label, _ in _EXTRACTION_COLUMNS)]]
+    rows += [[row["cells"], *_cells(row, _EXTRACTION_COLUMNS)] for row in header["extractions"]]
     return f"{_table(rows)}\n\n{_sentence(_machine(header))}; preset `{header['preset']}`."
 
 

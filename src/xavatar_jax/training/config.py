@@ -147,7 +147,7 @@ class FitConfig:
     steps: int = 1500
     minutes: float | None = None
     train_frames: int = 200
-    frames_per_minute: int = 20
+    frames_per_minute: int = 40
     frames_per_step: int = 16
     points_per_step: int = 512
     skinning_every: int = 4
