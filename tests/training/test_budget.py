@@ -29,11 +29,11 @@ class Clock:
 
 @pytest.mark.parametrize(
     ("minutes", "train_frames", "expected"),
-    [(None, 200, 200), (None, 0, 0), (1.5, 200, 30), (4.0, 200, 80), (60.0, 200, 200),
-     (2.0, 0, 40), (0.0, 200, 24), (1.0, 10, 10)],
+    [(None, 200, 200), (None, 0, 0), (1.5, 200, 30), (4.0, 200, 180), (60.0, 200, 200),
+     (2.0, 0, 60), (0.0, 200, 24), (1.0, 10, 10)],
 )  # fmt: skip
 def test_frames_of_a_budget(minutes, train_frames, expected):
-    config = replace(xa.quick(), minutes=minutes, train_frames=train_frames, frames_per_minute=20)
+    config = replace(xa.quick(), minutes=minutes, train_frames=train_frames)
     assert frames_in_budget(config) == expected
     assert frames_in_budget(replace(config, frames_per_minute=0)) == train_frames
 

@@ -34,11 +34,12 @@ class Budget(Protocol):
 def frames_in_budget(config: Budget) -> int:
     """How many frames to learn from (0: all): `train_frames`, or what `minutes` can label.
 
-    Told by the config alone, so that no draw depends on a clock.
+    The first minute is for what any run begins with: first fields, compilation, steps. Told by
+    the config alone, so that no draw depends on a clock.
     """
     if config.minutes is None or not config.frames_per_minute:
         return config.train_frames
-    most = max(round(config.minutes * config.frames_per_minute), _LEAST_FRAMES)
+    most = max(round((config.minutes - 1) * config.frames_per_minute), _LEAST_FRAMES)
     return min(config.train_frames, most) if config.train_frames else most
 
 

@@ -129,7 +129,8 @@ class FitConfig:
       to hold.
     - `train_frames`: frames drawn for their variety (0: all). Memory grows with their number, and
       not with that of the frames they are drawn from.
-    - `frames_per_minute`: with `minutes`, no more frames than so many for each (0: no limit).
+    - `frames_per_minute`: with `minutes`, no more frames than so many for each after the
+      first (0: no limit).
     - `points`: how many points a frame gives, and where.
     - `frames_per_step`, `points_per_step` (of each frame).
     - `skinning_every`, `skinning_points`: with stored roots, every so many steps the skinning
@@ -147,7 +148,7 @@ class FitConfig:
     steps: int = 1500
     minutes: float | None = None
     train_frames: int = 200
-    frames_per_minute: int = 40
+    frames_per_minute: int = 60
     frames_per_step: int = 16
     points_per_step: int = 512
     skinning_every: int = 4

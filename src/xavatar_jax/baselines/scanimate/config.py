@@ -78,7 +78,8 @@ class ScanimateConfig:
 
     - `minutes`: from the call, all stages together.
     - `train_frames`: frames drawn for their variety (0: all), with `minutes` no more than
-      `frames_per_minute` for each (0: no limit); `triangles`: kept of each, drawn by area.
+      `frames_per_minute` for each after the first (0: no limit); `triangles`: kept of each,
+      drawn by area.
     - `start`: fields that are fitted to the body's mean shape first, as those of `fit` are.
     - `forward`, `distance`: networks in place of the fields of `start` (None: those).
     - `inverse`: the inverse net, with a latent vector of `latent` numbers a frame; where `known`,
@@ -92,7 +93,7 @@ class ScanimateConfig:
     seed: int = 0
     minutes: float | None = None
     train_frames: int = 100
-    frames_per_minute: int = 40
+    frames_per_minute: int = 60
     triangles: int = 1500
     start: FitConfig = snarf_quick()
     forward: MLPShape | None = None
