@@ -23,6 +23,10 @@ def test_softplus_and_two_derivatives(sharpness):
     np.testing.assert_allclose(bend, sharpness * share * (1 - share), atol=1e-3 * sharpness)
 
 
-def test_softplus_in_float64_is_exact(x64):
-    x = np.linspace(-3, 3, 101)
-    np.testing.assert_allclose(softplus(jnp.asarray(x), 10.0), np.logaddexp(0, 10 * x) / 10)
+@pytest.mark.parametrize("sharpness", [1.0, 10.0, 100.0])
+def test_softplus_in_float64_is_exact(x64, sharpness):
+    x = np.linspace(-8, 8, 4001)
+    expected = np.logaddexp(0, sharpness * x) / sharpness
+    np.testing.assert_allclose(
+        softplus(jnp.asarray(x), sharpness), expected, rtol=1e-13, atol=1e-14
+    )

@@ -212,6 +212,7 @@ def test_every_call_has_the_same_shape_and_type():
     shape = ((1000, 3), np.dtype(np.float32))
     assert seen == {("field", *shape), ("gradient", *shape)}
     plain = extract_surface(field, BOUNDS, **sizes)
+    np.testing.assert_allclose(mesh.vertices, plain.vertices, atol=2e-3)
     np.testing.assert_allclose(mesh.normals, plain.normals, atol=5e-3)
 
 

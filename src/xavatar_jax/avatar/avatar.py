@@ -283,8 +283,9 @@ class Avatar:
             return np.asarray(logits(self.fields, jnp.asarray(points), condition))
 
         template, batch = self._canonical_vertices, batch_size(self.config)
-        steps = {"edge_steps": 1, "project_steps": 1}
-        return self._extract(field, template, cell, max_vertices, batch, **steps)
+        return self._extract(
+            field, template, cell, max_vertices, batch, edge_steps=1, project_steps=1
+        )
 
     def _extract_posed(
         self, params: BodyParams, cell: CellSizes | float | None, max_vertices: int | None

@@ -46,7 +46,7 @@ def dual_polygons(tree: Octree, pairs: Int[np.ndarray, "K 2"]) -> Polygons:
     vertex_at = np.full((len(tree.level), 6), -1, dtype=np.int32)
     vertex_at[pairs[:, 0], 2 * axis + ~above] = np.arange(len(pairs))
     places = _corners_between(tree, pairs, axis, above)
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(2) as pool:  # most of it is NumPy, which lets go of the lock
         blocks = pool.map(
             lambda start: _polygons_at(tree, inside, vertex_at, places[start : start + _BLOCK]),
             range(0, len(places), _BLOCK),
@@ -81,6 +81,7 @@ def _corners_between(
     strides = _strides(tree)
     first = tree.corner[pairs[:, 0]] @ strides + above * size * strides[axis]
     u, v = strides[(axis + 1) % 3] * size, strides[(axis + 2) % 3] * size
+    # What `np.unique` does, which takes several times as long for so many.
     ordered = np.sort(np.concatenate([first, first + u, first + v, first + u + v]))
     return ordered[np.append(True, ordered[1:] != ordered[:-1])]
 
@@ -100,8 +101,8 @@ def _polygons_at(
     """Polygons in the dual cubes around lattice points: vertices, padded by -1, and how many."""
     table = cube_table()
     strides = _strides(tree)
-    rows, rest = np.divmod(places, strides[0])
-    lattice = np.stack([rows, *np.divmod(rest, strides[1])], axis=1).astype(np.int32)
+    x, rest = np.divmod(places, strides[0])
+    lattice = np.stack([x, *np.divmod(rest, strides[1])], axis=1).astype(np.int32)
     around = tree.locate((lattice[:, None] + _AROUND).reshape(-1, 3)).reshape(-1, 8)
     pattern = np.packbits(inside[around], axis=1, bitorder="little")[:, 0]
     rows = np.flatnonzero(table.count[pattern])

@@ -34,7 +34,6 @@ class FieldSampler:
             raise ValueError(f"batch_points must be 1 or more, found {batch_points}.")
         self.bounds = bounds
         self.lowest, self.highest, self.count = np.inf, -np.inf, 0
-        self.has_gradient = gradient is not None
         self._field, self._gradient = field, gradient
         self._level, self._batch = level, batch_points
         self._bar = None

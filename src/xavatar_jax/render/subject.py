@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry import face_normals, vertex_normals
+from ..geometry import face_normals, sum_at_vertices, vertex_normals
 from ..meshing import Mesh
 from .camera import Camera
 from .light import SKY_RAYS, key_visibility, openness, to_linear
@@ -116,14 +116,12 @@ def _smoothed(
 ) -> Float[np.ndarray, "V C"]:
     """Averages over the faces around each vertex, several times; what is not a number is left
     out, and 1 where no neighbour knows."""
-    corners = faces.reshape(-1)
     known = np.isfinite(values[:, :1]).astype(np.float32)
     # The last column counts.
     sums = np.concatenate([np.nan_to_num(values), known], axis=1)
     for _ in range(times):
         mixed = sums[faces[:, 0]] + sums[faces[:, 1]] + sums[faces[:, 2]]
-        columns = np.repeat(mixed, 3, axis=0).T
-        sums = np.stack([np.bincount(corners, c, minlength=len(values)) for c in columns], axis=1)
+        sums = sum_at_vertices(mixed, faces, len(values))
         sums /= np.maximum(sums[:, -1:], 1e-6)
         sums[:, -1] = sums[:, -1] > 0.5
     found = sums[:, -1:] > 0
