@@ -284,7 +284,7 @@ class Avatar:
 
         template, batch = self._canonical_vertices, batch_size(self.config)
         return self._extract(
-            field, template, cell, max_vertices, batch, edge_steps=1, project_steps=1
+            field, template, cell, max_vertices, batch, edge_steps=0, project_steps=1
         )
 
     def _extract_posed(

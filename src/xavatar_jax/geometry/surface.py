@@ -1,11 +1,16 @@
-"""Areas, normals and random samples of a triangle surface."""
+"""Areas, normals, sums over faces and random samples of a triangle surface."""
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from ._check import check_mesh
 from .libigl import area_weighted_normals, doubled_areas
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
 
 
 def _doubled_area_vectors(
@@ -49,16 +54,17 @@ def vertex_normals(vertices: ArrayLike, faces: ArrayLike) -> Float[np.ndarray, "
     return area_weighted_normals(*check_mesh(vertices, faces))
 
 
-def sum_at_vertices(
-    values: Float[np.ndarray, "F K"], faces: Int[np.ndarray, "F 3"], count: int
-) -> Float[np.ndarray, "V K"]:
-    """Sum over the faces at each of `count` vertices."""
+def corner_matrix(faces: Int[np.ndarray, "F 3"], count: int, dtype: DTypeLike) -> "csc_matrix":
+    """Of `count` vertices and F faces, 1 where a vertex is a corner of a face: (V, F), sparse.
+
+    `matrix @ x` sums over the faces at each vertex, `matrix.T @ x` over the corners of each face.
+    """
     from scipy.sparse import csc_matrix
 
     # Column by column, where each face's three ones are.
-    ones = np.ones(faces.size, dtype=values.dtype)
     starts = np.arange(0, faces.size + 1, 3)
-    return csc_matrix((ones, faces.reshape(-1), starts), shape=(count, len(faces))) @ values
+    ones = np.ones(faces.size, dtype=dtype)
+    return csc_matrix((ones, faces.reshape(-1), starts), shape=(count, len(faces)))
 
 
 def enclosed_volume(vertices: ArrayLike, faces: ArrayLike) -> float:

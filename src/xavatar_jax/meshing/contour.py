@@ -9,13 +9,13 @@ by them.
 Source: Schaefer and Warren 2004, "Dual marching cubes: primal contouring of dual grids".
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from .blocks import in_blocks
 from .cube_table import MAX_SIDES, cube_table
 from .octree import Octree
 
@@ -46,12 +46,9 @@ def dual_polygons(tree: Octree, pairs: Int[np.ndarray, "K 2"]) -> Polygons:
     vertex_at = np.full((len(tree.level), 6), -1, dtype=np.int32)
     vertex_at[pairs[:, 0], 2 * axis + ~above] = np.arange(len(pairs))
     places = _corners_between(tree, pairs, axis, above)
-    with ThreadPoolExecutor(2) as pool:  # most of it is NumPy, which lets go of the lock
-        blocks = pool.map(
-            lambda start: _polygons_at(tree, inside, vertex_at, places[start : start + _BLOCK]),
-            range(0, len(places), _BLOCK),
-        )
-        corners, sides = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    corners, sides = in_blocks(
+        lambda rows: _polygons_at(tree, inside, vertex_at, places[rows]), len(places), _BLOCK
+    )
     used = np.zeros(len(pairs) + 1, dtype=bool)
     used[corners] = True
     used[-1] = False  # what pads the rows

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry import sum_at_vertices, vertex_normals
+from ..geometry import corner_matrix, vertex_normals
+from .blocks import in_blocks
 from .octree import Octree
 from .sampler import FieldSampler
 
@@ -20,6 +21,17 @@ def place_between(
     the last evaluation (V,; infinite without one), and how the field falls from end to end, value
     a metre, along the segments (V, 3).
     """
+
+    def place(rows: slice) -> tuple[np.ndarray, ...]:
+        return _placed(tree, sampler, leaves[rows], steps)
+
+    positions, values, falls = in_blocks(place, len(leaves), sampler.block_rows)
+    return positions, values, falls
+
+
+def _placed(
+    tree: Octree, sampler: FieldSampler, leaves: Int[np.ndarray, "V 2"], steps: int
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V"], Float[np.ndarray, "V 3"]]:
     start, end = tree.centres(leaves[:, 0]), tree.centres(leaves[:, 1])
     low, high = np.zeros(len(leaves)), np.ones(len(leaves))
     f_low, f_high = tree.value[leaves[:, 0]].copy(), tree.value[leaves[:, 1]].copy()
@@ -72,31 +84,49 @@ def spread_and_project(
         mean = _neighbour_mean(np.concatenate([positions, terms], axis=1), faces)
         above, below = (terms + mean[:, 3:]).T
         slopes = np.maximum(above, np.finfo(np.float32).tiny) / np.maximum(below, 1e-6)
-        towards = 0.6 * (mean[:, :3] - positions)
-        towards -= (towards * normal).sum(axis=1, keepdims=True) * normal
-        # Values fall outwards, along the normal; the value that the old position had is undone too.
-        known = np.where(np.isfinite(values), values, 0.0)
-        moved = positions + towards + (known / slopes)[:, None] * normal
-        moved = _within_reach(moved, positions, 0.5 * sizes)
-        before = sampler(moved)
-        first = np.clip(before / slopes, -0.25 * sizes, 0.25 * sizes)
-        polished = _within_reach(moved + first[:, None] * normal, origin, 0.75 * sizes)
-        after = sampler(polished)
-        # The slope that was met takes a third step. It is checked where it is more than a touch.
-        slopes = np.clip(_ratio(before - after, first, slopes), 0.25 * slopes, 4 * slopes)
-        second = np.clip(after / slopes, -0.25 * sizes, 0.25 * sizes)
-        again = _within_reach(polished + second[:, None] * normal, origin, 0.75 * sizes)
-        take = np.abs(second) < 2e-3 * sizes
-        far = np.flatnonzero(~take)
-        value = sampler(again[far])
-        take[far] = np.abs(value) < np.abs(after[far])
-        after[far] = np.where(take[far], value, after[far])
-        polished = np.where(take[:, None], again, polished)
-        tolerance = np.maximum(np.abs(values), 0.01 * sizes * slopes)
-        accept = (np.abs(after) <= tolerance) & sampler.within(polished)
-        positions = np.where(accept[:, None], polished, positions)
-        values = np.where(accept, after, values)
+        whole = origin, positions, values, mean[:, :3], normal, slopes, sizes
+
+        def project(rows: slice, whole: tuple[np.ndarray, ...] = whole) -> tuple[np.ndarray, ...]:
+            return _projected(sampler, *(part[rows] for part in whole))
+
+        positions, values = in_blocks(project, len(positions), sampler.block_rows)
     return positions
+
+
+def _projected(
+    sampler: FieldSampler,
+    origin: Float[np.ndarray, "V 3"],
+    positions: Float[np.ndarray, "V 3"],
+    values: Float[np.ndarray, "V"],
+    mean: Float[np.ndarray, "V 3"],
+    normal: Float[np.ndarray, "V 3"],
+    slopes: Float[np.ndarray, "V"],
+    sizes: Float[np.ndarray, "V"],
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V"]]:
+    """One round of `spread_and_project`: positions and the values there."""
+    towards = 0.6 * (mean - positions)
+    towards -= (towards * normal).sum(axis=1, keepdims=True) * normal
+    # Values fall outwards, along the normal; the value that the old position had is undone too.
+    known = np.where(np.isfinite(values), values, 0.0)
+    moved = positions + towards + (known / slopes)[:, None] * normal
+    moved = _within_reach(moved, positions, 0.5 * sizes)
+    before = sampler(moved)
+    first = np.clip(before / slopes, -0.25 * sizes, 0.25 * sizes)
+    polished = _within_reach(moved + first[:, None] * normal, origin, 0.75 * sizes)
+    after = sampler(polished)
+    # The slope that was met takes a third step. It is checked where it is more than a touch.
+    slopes = np.clip(_ratio(before - after, first, slopes), 0.25 * slopes, 4 * slopes)
+    second = np.clip(after / slopes, -0.25 * sizes, 0.25 * sizes)
+    again = _within_reach(polished + second[:, None] * normal, origin, 0.75 * sizes)
+    take = np.abs(second) < 2e-3 * sizes
+    far = np.flatnonzero(~take)
+    value = sampler(again[far])
+    take[far] = np.abs(value) < np.abs(after[far])
+    after[far] = np.where(take[far], value, after[far])
+    polished = np.where(take[:, None], again, polished)
+    tolerance = np.maximum(np.abs(values), 0.01 * sizes * slopes)
+    accept = (np.abs(after) <= tolerance) & sampler.within(polished)
+    return np.where(accept[:, None], polished, positions), np.where(accept, after, values)
 
 
 def _slope_terms(
@@ -135,8 +165,7 @@ def _neighbour_mean(
     """Mean over each vertex's neighbours; its own if it has none."""
     count = np.bincount(faces.reshape(-1), minlength=len(values))
     # Every neighbour appears twice on a closed mesh: once in each of the two faces of the edge.
-    first, second, third = faces.T
-    of_faces = values[first] + values[second] + values[third]
-    sums = sum_at_vertices(of_faces, faces, len(values)) - count[:, None] * values
+    corners = corner_matrix(faces, len(values), values.dtype)
+    sums = corners @ (corners.T @ values) - count[:, None] * values
     mean = sums / np.maximum(2 * count, 1)[:, None]
     return np.where(count[:, None] > 0, mean, values)

@@ -1,6 +1,7 @@
 """Evaluation of a field in batches of one fixed size, so that a jitted field never retraces."""
 
 from collections.abc import Callable
+from threading import Lock
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,8 @@ class FieldSampler:
     """Calls a field on float32 batches of exactly `batch_points` rows, padding the last.
 
     Values are relative to `level`; outside `bounds` the sampler answers "outside" by itself, so
-    that every surface is closed at the bounds. It keeps the range of values and a count.
+    that every surface is closed at the bounds. It keeps the range of values and a count. More
+    than one thread may call it if the field allows.
     """
 
     def __init__(
@@ -36,6 +38,7 @@ class FieldSampler:
         self.lowest, self.highest, self.count = np.inf, -np.inf, 0
         self._field, self._gradient = field, gradient
         self._level, self._batch = level, batch_points
+        self._lock = Lock()
         self._bar = None
         if verbose:
             from tqdm.auto import tqdm
@@ -47,6 +50,11 @@ class FieldSampler:
         if self._bar is not None:
             self._bar.close()
 
+    @property
+    def block_rows(self) -> int:
+        """Rows of a block of work of which few are padding in the end."""
+        return 4 * self._batch
+
     def __call__(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
         """Field minus level, float64, never exactly zero; negative outside the bounds."""
         within = self.within(points)
@@ -54,8 +62,9 @@ class FieldSampler:
         raw = self._run(self._field, points if every else points[within], ())
         values = raw.astype(np.float64) - self._level
         if len(values):
-            self.lowest = min(self.lowest, float(values.min()))
-            self.highest = max(self.highest, float(values.max()))
+            with self._lock:
+                self.lowest = min(self.lowest, float(values.min()))
+                self.highest = max(self.highest, float(values.max()))
         # An exact zero has no side. Outside it is, by the smallest amount that still divides.
         values[values == 0] = -np.finfo(np.float32).tiny
         if every:
@@ -96,9 +105,10 @@ class FieldSampler:
                     f"({self._batch}, 3) with shape {(self._batch, *shape)}, found {answer.shape}."
                 )
             results[start : start + rows] = answer[:rows]
-            self.count += rows
-            if self._bar is not None:
-                self._bar.update(rows)
+            with self._lock:
+                self.count += rows
+                if self._bar is not None:
+                    self._bar.update(rows)
         if not np.isfinite(results).all():
             bad = ~np.isfinite(results).all(axis=tuple(range(1, results.ndim)))
             first = np.asarray(points)[bad][0]

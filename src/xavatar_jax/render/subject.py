@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry import face_normals, sum_at_vertices, vertex_normals
+from ..geometry import corner_matrix, face_normals, vertex_normals
 from ..meshing import Mesh
 from .camera import Camera
 from .light import SKY_RAYS, key_visibility, openness, to_linear
@@ -119,9 +119,9 @@ def _smoothed(
     known = np.isfinite(values[:, :1]).astype(np.float32)
     # The last column counts.
     sums = np.concatenate([np.nan_to_num(values), known], axis=1)
+    corners = corner_matrix(faces, len(values), sums.dtype)
     for _ in range(times):
-        mixed = sums[faces[:, 0]] + sums[faces[:, 1]] + sums[faces[:, 2]]
-        sums = sum_at_vertices(mixed, faces, len(values))
+        sums = corners @ (corners.T @ sums)
         sums /= np.maximum(sums[:, -1:], 1e-6)
         sums[:, -1] = sums[:, -1] > 0.5
     found = sums[:, -1:] > 0

@@ -58,8 +58,8 @@ class SearchConfig:
     """Where roots come from.
 
     - `starts`: which bones start a point's search.
-    - `cached`: search once on the tabulated field when points are drawn, and polish the roots by
-      a Newton step whenever they are used; else search inside every training step.
+    - `cached`: search once on the tabulated field when points are drawn, and polish the
+      roots by Newton steps now and then; else search inside every training step.
     - `grid`: the grids of the tabulated search; `keep`: roots kept a point; `atol`: metres.
     """
 

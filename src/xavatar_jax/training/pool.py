@@ -235,7 +235,7 @@ def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool
 
 
 def polish_roots(
-    skinning: AbstractSkinningField, table: TabulatedSkinning, pool: FramePool, *, steps: int = 2
+    skinning: AbstractSkinningField, table: TabulatedSkinning, pool: FramePool, *, steps: int
 ) -> FramePool:
     """Move every stored root to where the field has it now, by Newton steps.
 

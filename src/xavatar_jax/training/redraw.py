@@ -77,7 +77,7 @@ class Redraw:
         assert self._waiting[0] == number
         new = self._waiting[1].result()
         if self._table is not None:
-            new = polish_roots(skinning, self._table, new)
+            new = polish_roots(skinning, self._table, new, steps=2)
         return new
 
     def close(self) -> None:

@@ -247,7 +247,8 @@ class Run:
         """Let stored roots follow the skinning field; on one device, for it is little work."""
         skinning = self.devices.collect(with_learned(self.base, self.state).skinning)
         table = tabulate_for_search(self.body, self.betas, skinning, self.config)
-        pool = polish_roots(skinning, table, self.devices.collect(self.pool))
+        # Since the last time roots have moved so little that one step leaves micrometres.
+        pool = polish_roots(skinning, table, self.devices.collect(self.pool), steps=1)
         self.pool = self.devices.replicate(pool)
 
     def _take_redrawn(self, number: int) -> None:
