@@ -5,10 +5,11 @@ meshes, how long does a GLB file of 300 frames take, and how long the canonical 
 sizes of cells?
 
     python benchmarks/animate.py out/fit_grab/avatar.npz [--quick] [--json FILE]
+    python benchmarks/animate.py out/paper/avatar.npz --surface [--quick] [--json FILE]
 
 The avatar is one that `examples/fit_grab.py` wrote, on the bundled body; the motion is its held-out
 sequences, one after another. Each way of following pose and expression is a row; distances are
-those to `Avatar.mesh` of the same frame.
+those to `Avatar.mesh` of the same frame. `--surface` measures the canonical surface alone.
 """
 
 from __future__ import annotations
@@ -111,17 +112,11 @@ def measure_extraction(avatar: xa.Avatar, cells: str) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("avatar", help="avatar.npz of examples/fit_grab.py")
-    parser.add_argument("--quick", action="store_true", help="fewer frames")
-    parser.add_argument("--json", help="write the figures to this file")
-    args = parser.parse_args()
-    body = xa.synthetic_body()
-    avatar = xa.load_avatar(args.avatar, body=body)
-    motion = held_out_motion(body, 60 if args.quick else 300)
+def measure_motion(
+    avatar: xa.Avatar, quick: bool
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]]:
+    """Rows of animation and of export, and what comes before the first frame."""
+    motion = held_out_motion(avatar.body, 60 if quick else 300)
     start = time.perf_counter()
     avatar.canonical_mesh()
     extracted = time.perf_counter()
@@ -130,23 +125,46 @@ def main() -> None:
     rows = [
         measure_animation(
             avatar.animate(motion, offsets=offsets),
-            {"exact": 3}.get(offsets, 30 if args.quick else 300),
-            2 if args.quick else 12,
+            {"exact": 3}.get(offsets, 30 if quick else 300),
+            2 if quick else 12,
         )
         for offsets in OFFSETS
     ]
     exports = [measure_export(avatar, motion, influences) for influences in (4, 8)]
+    return (
+        rows,
+        exports,
+        {
+            "vertices": avatar.canonical_mesh().num_vertices,
+            "frames": len(motion),
+            "extraction_s": extracted - start,
+            "base_s": ready - extracted,
+        },
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("avatar", help="avatar.npz of examples/fit_grab.py")
+    parser.add_argument("--quick", action="store_true", help="fewer frames")
+    parser.add_argument("--surface", action="store_true", help="the canonical surface alone")
+    parser.add_argument("--json", help="write the figures to this file")
+    args = parser.parse_args()
+    body = xa.synthetic_body()
+    avatar = xa.load_avatar(args.avatar, body=body)
+    rows, exports, header = [], [], {}
+    if not args.surface:
+        rows, exports, header = measure_motion(avatar, args.quick)
     sizes = list(CELLS)[:1] if args.quick else CELLS
     extractions = [measure_extraction(avatar, cells) for cells in sizes]
     header = {
         "question": "frames a second of animation, distance to exact frames, time of export",
         **describe_machine(),
         "quick": args.quick,
-        "vertices": avatar.canonical_mesh().num_vertices,
-        "frames": len(motion),
         "preset": avatar.config.preset,
-        "extraction_s": extracted - start,
-        "base_s": ready - extracted,
+        **header,
         "exports": exports,
         "extractions": extractions,
     }

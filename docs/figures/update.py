@@ -37,6 +37,7 @@ TEXTS = (
 )
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
 ANIMATE, VIEW = "animate.json", "view_and_render.json"
+SURFACE = "surface_paper.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
 BORDERS = "part_borders.json"
 FLOOR = "metric_floor.json"
@@ -79,6 +80,7 @@ _ENTRIES = (
     ("optimiser.skinning_rate", "{}"),
     ("optimiser.schedule", "{}"),
     ("optimiser.clip", "{}"),
+    ("optimiser.warmup", "{}, steps"),
     ("validation.every", "{}, steps"),
     ("validation.patience", "{}, steps"),
     ("prefit_steps", "{}"),
@@ -512,6 +514,7 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{ANIMATE}": animate_view,
     f"docs/figures/{ANIMATE} export": export_view,
     f"docs/figures/{ANIMATE} extraction": extraction_view,
+    f"docs/figures/{SURFACE}": extraction_view,
     f"docs/figures/{VIEW}": seconds_view,
     f"docs/figures/{SEARCH} 20": paths_view(20.0),
     f"docs/figures/{SEARCH} 40": paths_view(40.0),
@@ -581,6 +584,7 @@ _STORED = {
     "metrics": METRICS,
     "part_aware": PART_AWARE,
     "animate": ANIMATE,
+    "surface": SURFACE,
     "view": VIEW,
     "correspondence": SEARCH,
     "gradients": GRADIENTS,
@@ -599,6 +603,7 @@ def main() -> None:
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
     parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
     parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
+    parser.add_argument("--surface", help="JSON of benchmarks/animate.py --surface, preset paper")
     parser.add_argument("--view", help="JSON of benchmarks/view_and_render.py")
     parser.add_argument("--correspondence", help="JSON of benchmarks/correspondence.py")
     parser.add_argument("--gradients", help="JSON of benchmarks/gradients.py")

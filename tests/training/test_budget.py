@@ -16,7 +16,7 @@ from xavatar_jax.files import load_arrays
 from xavatar_jax.training import TrainingNotice, budget, choose_frames, loop
 from xavatar_jax.training.budget import Pace, frames_in_budget
 from xavatar_jax.training.config import config_from_dict, config_to_dict
-from xavatar_jax.training.step import falling
+from xavatar_jax.training.step import rate_factor
 
 
 class Clock:
@@ -79,11 +79,21 @@ def test_slow_steps_are_timed_less_and_whole_cycles_long(monkeypatch):
 def test_a_falling_rate_ends_at_a_hundredth_of_any_total():
     config = xa.quick()
     for total in (10, 1500):
-        left = [float(falling(config, jnp.asarray(k), jnp.asarray(total))) for k in (0, total)]
+        left = [float(rate_factor(config, jnp.asarray(k), jnp.asarray(total))) for k in (0, total)]
         np.testing.assert_allclose(left, [1.0, 0.01], rtol=1e-5)
-    middle = float(falling(config, jnp.asarray(50), jnp.asarray(100)))
+    middle = float(rate_factor(config, jnp.asarray(50), jnp.asarray(100)))
     np.testing.assert_allclose(middle, (1 + 0.01) / 2, rtol=1e-5)
-    assert float(falling(xa.paper(), jnp.asarray(9), jnp.asarray(10))) == 1.0
+    config = replace(config, optimiser=replace(config.optimiser, schedule="constant"))
+    assert float(rate_factor(config, jnp.asarray(9), jnp.asarray(10))) == 1.0
+
+
+def test_rates_rise_in_equal_parts_and_multiply_what_falls():
+    config = xa.quick()
+    rising = replace(config, optimiser=replace(config.optimiser, warmup=4))
+    for k, part in enumerate((0.25, 0.5, 0.75, 1.0, 1.0)):
+        step, total = jnp.asarray(k), jnp.asarray(100)
+        expected = part * rate_factor(config, step, total)
+        np.testing.assert_allclose(rate_factor(rising, step, total), expected, rtol=1e-6)
 
 
 def test_a_plan_is_kept_by_a_run_that_goes_on(case, no_prefit, tmp_path, monkeypatch):

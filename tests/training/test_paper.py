@@ -16,7 +16,7 @@ from xavatar_jax.correspondence import start_table
 from xavatar_jax.fields import MLPGeometry, MLPShape, MLPSkinning
 from xavatar_jax.training import AvatarFields, objective
 from xavatar_jax.training.batch import Batch
-from xavatar_jax.training.step import falling, make_optimiser
+from xavatar_jax.training.step import make_optimiser, rate_factor
 
 # Bones that start the search, by part label: body, face, left hand, right hand, eyes and mouth.
 FACE = (12, 15, 22)
@@ -190,7 +190,7 @@ def test_steps_are_adam_after_one_clip(rng):
     """The optimiser of the preset against the update written out; a step times the rate."""
     config = xa.paper()
     assert config.optimiser.skinning_rate == config.optimiser.learning_rate == 1e-3
-    assert falling(config, jnp.asarray(40_000), jnp.asarray(45_000)) == 1
+    assert rate_factor(config, jnp.asarray(40_000), jnp.asarray(45_000)) == 1
     optimiser = make_optimiser(config)
     value = {"a": np.zeros(4), "b": np.zeros((2, 3))}
     state = optimiser.init(jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), value))
@@ -222,6 +222,7 @@ def test_the_published_numbers():
     assert (losses.surface_parts, losses.surface_points) == ("hands_face", 0)
     assert (search.atol, search.max_steps, search.cached) == (1e-5, 50, False)
     assert (config.optimiser.schedule, config.optimiser.clip) == ("constant", 0.1)
+    assert config.optimiser.warmup == 1000  # ours: docs/options.md says why
     assert config.optimiser.learning_rate == 1e-3
     assert config.skinning.mlp == replace(MLPShape(), width=128, depth=5, octaves=0, skip=(),
                                           condition_at=())  # fmt: skip

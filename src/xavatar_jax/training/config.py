@@ -90,13 +90,17 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimiserConfig:
-    """Adam with a global-norm clip; `cosine` falls to a hundredth of the rate at the last step."""
+    """Adam with a global-norm clip; `cosine` falls to a hundredth of the rate at the last step.
+
+    `warmup`: steps over which the rates rise to what they are.
+    """
 
     learning_rate: float = 1e-3
     skinning_rate: float = 1e-3
     schedule: Literal["constant", "cosine"] = "constant"
     clip: float = 0.1
     epsilon: float = 1e-8
+    warmup: int = 0
 
 
 @dataclass(frozen=True)
@@ -205,7 +209,7 @@ def paper() -> FitConfig:
         geometry=GeometryConfig(kind="mlp"),
         search=SearchConfig(starts="paper", cached=False, keep=16, max_steps=50),
         losses=LossConfig(softness=0.0),
-        optimiser=OptimiserConfig(),
+        optimiser=OptimiserConfig(warmup=1000),
         validation=ValidationConfig(every=500, patience=10_000),
     )
 

@@ -45,21 +45,22 @@ Step = Callable[[TrainState, FramePool], tuple[TrainState, dict[str, Array]]]
 
 
 def make_optimiser(config: FitConfig) -> optax.GradientTransformation:
-    """Adam after a global-norm clip, at a rate of one: see `falling` for the rate."""
+    """Adam after a global-norm clip, at a rate of one: see `rate_factor` for the rate."""
     options = config.optimiser
     return optax.chain(
         optax.clip_by_global_norm(options.clip), optax.scale_by_adam(eps=options.epsilon)
     )
 
 
-def falling(config: FitConfig, step: Int[Array, ""], total: Int[Array, ""]) -> Float[Array, ""]:
-    """What is left of the learning rates at a step, from one to a hundredth at the last.
+def rate_factor(config: FitConfig, step: Int[Array, ""], total: Int[Array, ""]) -> Float[Array, ""]:
+    """The part of the learning rates at a step: rising first, then to a hundredth at the last.
 
     `total` may be told while a run goes on: it is no constant of the compiled step.
     """
+    risen = jnp.minimum((step + 1) / max(config.optimiser.warmup, 1), 1.0)
     if config.optimiser.schedule == "constant":
-        return jnp.ones(())
-    return cosine(step / jnp.maximum(total, 1).astype(jnp.float32))
+        return risen
+    return risen * cosine(step / jnp.maximum(total, 1).astype(jnp.float32))
 
 
 def cosine(share: Float[Array, ""]) -> Float[Array, ""]:
@@ -256,7 +257,7 @@ def _step(
     own = _own(state.learned, name)
     (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
     updates, optimiser_state = make_optimiser(config).update(gradient, state.optimisers[name], own)
-    updates = _at_rates(updates, name, config, falling(config, state.step, state.total))
+    updates = _at_rates(updates, name, config, rate_factor(config, state.step, state.total))
     learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
     optimisers = {**state.optimisers, name: optimiser_state}
     after = TrainState(learned, optimisers, state.step + 1, state.total)
