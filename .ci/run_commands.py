@@ -94,22 +94,22 @@ HOW = {
     ".venv/bin/python benchmarks/correspondence.py --json search.json --picture search.png": skip(
         "a stage of its own"
     ),
-    ".venv/bin/python benchmarks/gradients.py --json gradients.json": skip("takes many minutes"),
+    ".venv/bin/python benchmarks/gradients.py --json gradients.json": How(
+        True, "--quick --prefit-steps 20"
+    ),
     ".venv/bin/python benchmarks/part_borders.py --json borders.json": How(True, "--quick"),
-    ".venv/bin/python benchmarks/table1_ablations.py --json table1.json": skip("takes hours"),
-    ".venv/bin/python benchmarks/table2_grab.py --json table2.json": skip("takes hours"),
-    ".venv/bin/python benchmarks/memory.py --json memory.json": skip("takes many minutes"),
-    ".venv/bin/python benchmarks/accuracy_over_time.py --json curve.json --picture curve.png": skip(
-        "takes hours"
+    ".venv/bin/python benchmarks/table1_ablations.py --json table1.json": How(
+        True, "--quick --only complete"
+    ),
+    ".venv/bin/python benchmarks/table2_grab.py --json table2.json": How(
+        True, "--quick --only quick"
+    ),
+    ".venv/bin/python benchmarks/memory.py --json memory.json": How(True, "--quick --counts 60"),
+    ".venv/bin/python benchmarks/accuracy_over_time.py --json curve.json --picture curve.png": How(
+        True, "--quick"
     ),
     "npm install --prefix ~/gltf_tools gltf-validator three": skip("a stage of its own"),
     "python3.11 -m venv ~/bpy && ~/bpy/bin/pip install bpy==5.0.1": skip("a stage of its own"),
-    f"{_FIT} --preset paper --steps 20 --train-frames 20 --eval-frames 2 --out out/paper": skip(
-        "the networks of `paper` are fitted for minutes"
-    ),
-    ".venv/bin/python benchmarks/animate.py out/paper/avatar.npz --surface --json surface.json": (
-        skip("the same for out/fit_grab is a stage of its own")
-    ),
     "GLTF_TOOLS=~/gltf_tools BPY_PYTHON=~/bpy/bin/python .venv/bin/python -m pytest tests/export "
     "tests/avatar": skip("the last stage"),
 }
