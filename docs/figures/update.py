@@ -37,7 +37,7 @@ TEXTS = (
 )
 METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
 ANIMATE, VIEW = "animate.json", "view_and_render.json"
-SURFACE = "surface_paper.json"
+PAPER, SURFACE = "metrics_paper.json", "surface_paper.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
 BORDERS = "part_borders.json"
 FLOOR = "metric_floor.json"
@@ -159,6 +159,18 @@ def accuracy_view(record: dict[str, Any]) -> str:
         f"{record['peak_rss_mb'] / 1024:.1f} GiB of memory at most. "
         f"*Before* is the start, the body's mean shape on the person's skeleton, "
         f"on {few} of the frames."
+    )
+
+
+def paper_view(record: dict[str, Any]) -> str:
+    """The same for some steps of `paper`, and how long all of them would take."""
+    import xavatar_jax as xa
+
+    steps = xa.paper().steps
+    seconds = record["stages"]["train"] / record["steps"]
+    return (
+        f"{accuracy_view(record)} A step takes {seconds:.0f} s: the {steps:,} of the whole "
+        f"schedule would take {steps * seconds / 3600:.0f} hours."
     )
 
 
@@ -509,6 +521,7 @@ def presets_view() -> str:
 VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{METRICS}": accuracy_view,
     f"docs/figures/{METRICS} stages": stages_view,
+    f"docs/figures/{PAPER}": paper_view,
     f"docs/figures/{METRICS} distance": distance_view,
     f"docs/figures/{PART_AWARE}": benchmark_view,
     f"docs/figures/{ANIMATE}": animate_view,
@@ -582,6 +595,7 @@ def _store(source: str, name: str, slim: Callable[[dict[str, Any]], dict[str, An
 
 _STORED = {
     "metrics": METRICS,
+    "metrics_paper": PAPER,
     "part_aware": PART_AWARE,
     "animate": ANIMATE,
     "surface": SURFACE,
@@ -601,6 +615,7 @@ _STORED = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
+    parser.add_argument("--metrics-paper", help="the same with --preset paper --steps 20")
     parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
     parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
     parser.add_argument("--surface", help="JSON of benchmarks/animate.py --surface, preset paper")
@@ -616,7 +631,7 @@ def main() -> None:
     args = parser.parse_args()
     for option, source in vars(args).items():
         if source:
-            slim = slim_metrics if option == "metrics" else slim_benchmark
+            slim = slim_metrics if option.startswith("metrics") else slim_benchmark
             _store(source, _STORED[option], slim)
     for name in TEXTS:
         path = ROOT / name

@@ -44,7 +44,8 @@ def extract_surface(
 
     Args:
         field: batched scalar field, positive inside, from (batch_points, 3) float32 metres to
-            (batch_points,). It is always called with exactly `batch_points` rows.
+            (batch_points,). It is always called with exactly `batch_points` rows, by two threads
+            at a time.
         bounds: lowest and highest corner (2, 3), metres.
         cell: edge of the finest cells, metres.
         cell_at: wanted edge of the cells at points (N, 3), metres. Edges used are `cell` times a
