@@ -7,7 +7,11 @@ from jaxtyping import Array, Float
 
 
 def inverse_3x3(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Inverse by cofactors. A singular matrix gives infinities or NaN: mask by the determinant."""
+    """Inverse by cofactors.
+
+    A matrix that is singular, or so small that products of three entries underflow, gives
+    infinities or NaN: mask by the determinant.
+    """
     cofactors, determinant = _cofactors(matrix)
     rows = [jnp.stack([cofactors[j][i] for j in range(3)], axis=-1) for i in range(3)]
     return jnp.stack(rows, axis=-2) / determinant[..., None, None]
