@@ -154,9 +154,9 @@ def main() -> None:
     args = parser.parse_args()
     body = xa.synthetic_body()
     avatar = xa.load_avatar(args.avatar, body=body)
-    rows, exports, header = [], [], {}
+    rows, exports, base = [], [], {}
     if not args.surface:
-        rows, exports, header = measure_motion(avatar, args.quick)
+        rows, exports, base = measure_motion(avatar, args.quick)
     sizes = list(CELLS)[:1] if args.quick else CELLS
     extractions = [measure_extraction(avatar, cells) for cells in sizes]
     header = {
@@ -164,7 +164,7 @@ def main() -> None:
         **describe_machine(),
         "quick": args.quick,
         "preset": avatar.config.preset,
-        **header,
+        **base,
         "exports": exports,
         "extractions": extractions,
     }

@@ -521,8 +521,8 @@ def presets_view() -> str:
 VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{METRICS}": accuracy_view,
     f"docs/figures/{METRICS} stages": stages_view,
-    f"docs/figures/{PAPER}": paper_view,
     f"docs/figures/{METRICS} distance": distance_view,
+    f"docs/figures/{PAPER}": paper_view,
     f"docs/figures/{PART_AWARE}": benchmark_view,
     f"docs/figures/{ANIMATE}": animate_view,
     f"docs/figures/{ANIMATE} export": export_view,

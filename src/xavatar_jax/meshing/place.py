@@ -1,5 +1,8 @@
 """Positions of surface vertices: between two leaves, then evenly spread, on the level set."""
 
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -21,11 +24,9 @@ def place_between(
     the last evaluation (V,; infinite without one), and how the field falls from end to end, value
     a metre, along the segments (V, 3).
     """
-
-    def place(rows: slice) -> tuple[np.ndarray, ...]:
-        return _placed(tree, sampler, leaves[rows], steps)
-
-    positions, values, falls = in_blocks(place, len(leaves), sampler.block_rows)
+    positions, values, falls = in_blocks(
+        lambda rows: _placed(tree, sampler, leaves[rows], steps), len(leaves), sampler.block_rows
+    )
     return positions, values, falls
 
 
@@ -84,26 +85,30 @@ def spread_and_project(
         mean = _neighbour_mean(np.concatenate([positions, terms], axis=1), faces)
         above, below = (terms + mean[:, 3:]).T
         slopes = np.maximum(above, np.finfo(np.float32).tiny) / np.maximum(below, 1e-6)
-        whole = origin, positions, values, mean[:, :3], normal, slopes, sizes
-
-        def project(rows: slice, whole: tuple[np.ndarray, ...] = whole) -> tuple[np.ndarray, ...]:
-            return _projected(sampler, *(part[rows] for part in whole))
-
+        vertices = _Vertices(origin, positions, values, mean[:, :3], normal, slopes, sizes)
+        project = partial(_projected, sampler, vertices)
         positions, values = in_blocks(project, len(positions), sampler.block_rows)
     return positions
 
 
+class _Vertices(NamedTuple):
+    """What a round of `spread_and_project` knows of each vertex: `mean` of its neighbours, and
+    how steeply values fall along its normal (`slopes`), besides that function's arguments."""
+
+    origin: Float[np.ndarray, "V 3"]
+    positions: Float[np.ndarray, "V 3"]
+    values: Float[np.ndarray, "V"]
+    mean: Float[np.ndarray, "V 3"]
+    normal: Float[np.ndarray, "V 3"]
+    slopes: Float[np.ndarray, "V"]
+    sizes: Float[np.ndarray, "V"]
+
+
 def _projected(
-    sampler: FieldSampler,
-    origin: Float[np.ndarray, "V 3"],
-    positions: Float[np.ndarray, "V 3"],
-    values: Float[np.ndarray, "V"],
-    mean: Float[np.ndarray, "V 3"],
-    normal: Float[np.ndarray, "V 3"],
-    slopes: Float[np.ndarray, "V"],
-    sizes: Float[np.ndarray, "V"],
-) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V"]]:
-    """One round of `spread_and_project`: positions and the values there."""
+    sampler: FieldSampler, vertices: _Vertices, rows: slice
+) -> tuple[Float[np.ndarray, "R 3"], Float[np.ndarray, "R"]]:
+    """One round of `spread_and_project` for some vertices: positions and the values there."""
+    origin, positions, values, mean, normal, slopes, sizes = (part[rows] for part in vertices)
     towards = 0.6 * (mean - positions)
     towards -= (towards * normal).sum(axis=1, keepdims=True) * normal
     # Values fall outwards, along the normal; the value that the old position had is undone too.
