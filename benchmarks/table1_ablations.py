@@ -5,13 +5,13 @@ the body's bones (A1) or at all bones (A2), if points are drawn without regard t
 if nothing holds the weights at the surface (A4)? And if the template's weights are kept as they
 are?
 
-Every row is a run of `xa.fit` of so many minutes from its call, on the bundled capture. Settings:
+Every row is a run of `xa.fit` of so many minutes from its call, on the bundled capture; with
+`--steps`, of so many steps, whatever they take. Settings:
 
 - `quick`: the preset, with roots that are found once and polished.
-- `quick-random`: its fields, but weights that start at random, without a template; roots are
-  searched in every step.
-- `mlp`, `mlp-random`: the paper's skinning network, fitted to the template first or as drawn;
-  roots are searched in every step.
+- `mlp`: the paper's skinning network, fitted to the mean shape's weights first; roots are searched
+  in every step, with a guide, on fewer points.
+- `mlp-random`: the same with the network as it was drawn.
 
     python benchmarks/table1_ablations.py --json table1.json [--settings NAME...] [--only NAME...]
 """
@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -29,15 +29,16 @@ from resumable import Row, add_options, every, fill, medians, score
 from search_problems import least_time
 
 import xavatar_jax as xa
-from xavatar_jax.fields import GridSpacing
 from xavatar_jax.training import ABLATIONS, FitConfig, initial_fields
+from xavatar_jax.training.budget import frames_in_budget
+from xavatar_jax.training.config import has_guide
 from xavatar_jax.training.objective import search_batch
-from xavatar_jax.training.pool import label_frames
+from xavatar_jax.training.pool import label_frames, tabulate_for_search
 from xavatar_jax.training.progress import progress
 from xavatar_jax.training.step import draw_batch
 
 NAMES = ("complete", *ABLATIONS, "fixed")
-SETTINGS = ("quick", "quick-random", "mlp", "mlp-random")
+SETTINGS = ("quick", "mlp", "mlp-random")
 COLUMNS = (
     *("cd_all_mm", "cd_hands_mm", "cd_face_mm", "steps", "step_ms", "search_share", "fit_s"),
     "frames",
@@ -49,33 +50,29 @@ def setting_config(setting: str, minutes: float) -> FitConfig:
     config = replace(xa.quick(), minutes=minutes, steps=20_000)
     if setting == "quick":
         return config
-    config = replace(
+    start: Literal["template", "random"] = "random" if setting.endswith("random") else "template"
+    return replace(
         config,
         frames_per_step=2,
-        points_per_step=1000,
-        search=replace(config.search, cached=False),
-        validation=replace(config.validation, every=100),
+        points_per_step=500,
+        frames_per_minute=30,
+        prefit_steps=4000 if start == "template" else config.prefit_steps,
+        settle_steps=1000,
+        skinning=replace(config.skinning, kind="mlp", start=start),
+        search=replace(config.search, cached=False, guide_every=50),
+        optimiser=replace(config.optimiser, skinning_rate=1e-3),
+        validation=replace(config.validation, share=0.0),
     )
-    skinning = config.skinning
-    if setting.startswith("mlp"):
-        skinning = replace(skinning, kind="mlp")
-        config = replace(config, optimiser=replace(config.optimiser, skinning_rate=1e-3))
-    if setting.endswith("random"):
-        # Without a template the learned grid is the field, and needs its nodes.
-        finer = GridSpacing(body=0.024, hands=0.008, face=0.012)
-        return replace(config, skinning=replace(skinning, start="random", correction=finer))
-    if setting == "mlp":
-        config = replace(
-            config,
-            prefit_steps=4000,
-            optimiser=replace(config.optimiser, skinning_rate=1e-4),
-        )
-    return replace(config, skinning=skinning)
 
 
 def small(config: FitConfig) -> FitConfig:
     """The same in a minute or so, to see that it runs."""
-    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=20)
+    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=20, settle_steps=20)
+
+
+def for_steps(config: FitConfig, steps: int) -> FitConfig:
+    """The same frames and so many steps, whatever they take."""
+    return replace(config, train_frames=frames_in_budget(config), minutes=None, steps=steps)
 
 
 def change(config: FitConfig, name: str) -> FitConfig:
@@ -93,9 +90,12 @@ def search_seconds(result: Any, capture: Any, config: FitConfig) -> float:
         pool = label_frames(capture.body, frames, config, bar=bar)
     config = replace(config, points_per_step=min(config.points_per_step, pool.points.shape[1]))
     batch = draw_batch(pool, config, config.points_per_step, 0, jax.random.key(config.seed))
-    search = eqx.filter_jit(lambda f, b: search_batch(f, b, config, capture.body.tree))
-    least_time(lambda: search(avatar.fields, batch), 1)
-    return least_time(lambda: search(avatar.fields, batch), 3)[1]
+    skinning, guide = avatar.fields.skinning, None
+    if has_guide(config):
+        guide = tabulate_for_search(capture.body, avatar.betas, skinning, config)
+    search = eqx.filter_jit(lambda s, g, b: search_batch(s, g, b, config, capture.body.tree))
+    least_time(lambda: search(skinning, guide, batch), 1)
+    return least_time(lambda: search(skinning, guide, batch), 3)[1]
 
 
 def measure(
@@ -103,6 +103,8 @@ def measure(
 ) -> dict[str, Any]:
     """Figures of one run."""
     config = setting_config(setting, args.minutes)
+    if args.steps:
+        config = for_steps(config, args.steps)
     config = change(small(config) if args.quick else config, name)
     config = replace(config, seed=seed)
     # The first fields are the same for all, and are not what is compared: they are made before.
@@ -155,6 +157,7 @@ def main() -> None:
     add_options(parser, NAMES, minutes=3)
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, metavar="NAME", help="of "
                         + ", ".join(SETTINGS))  # fmt: skip
+    parser.add_argument("--steps", type=int, help="of a run, in place of minutes")
     args = parser.parse_args()
     if args.quick:
         args.eval_frames, args.seeds = 1, 1
@@ -170,7 +173,8 @@ def main() -> None:
         question="the paper's ablations at equal time",
         settings={
             "quick": args.quick,
-            "minutes": args.minutes,
+            "minutes": None if args.steps else args.minutes,
+            "steps": args.steps,
             "eval_frames": args.eval_frames,
             "data": capture.name,
         },

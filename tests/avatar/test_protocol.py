@@ -52,7 +52,7 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
 
     monkeypatch.setattr(loop, "initial_fields", lambda *_, **__: run.fit.before.fields)
     # With the grid of the person, whose programs are compiled.
-    monkeypatch.setattr(loop, "settle_on_person", lambda *_: run.fit.avatar.fields)
+    monkeypatch.setattr(loop, "settle_on_person", lambda *_, **__: run.fit.avatar.fields)
     monkeypatch.setattr(xa, "fit", noted_fit)
     monkeypatch.setattr(xa, "evaluate", quick_evaluate)
     monkeypatch.setattr(command, "load", lambda options: capture)

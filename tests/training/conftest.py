@@ -31,7 +31,7 @@ def no_prefit(case):
     fields = case[3]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "initial_fields", lambda *_, **__: fields)
-        patch.setattr(loop, "settle_on_person", lambda *_: fields)
+        patch.setattr(loop, "settle_on_person", lambda *_, **__: fields)
         yield
 
 

@@ -79,14 +79,14 @@ def test_uniform_sampling_is_by_area_and_keeps_parts_and_noise():
 
 @pytest.mark.parametrize("kind", ["grid", "mlp"])
 def test_a_random_start_has_nothing_of_the_template(kind, case, tmp_path, monkeypatch):
-    """The fit to the mean shape leaves the weights as drawn, and so does settling."""
+    """The fit to the mean shape leaves the weights as drawn; settling takes steps of its own."""
     monkeypatch.setattr(prefit, "_POINTS", 2000)
     body, _, config, _, _ = case
     skinning = replace(
         config.skinning, kind=kind, start="random",
         mlp=MLPShape(width=32, depth=2, octaves=0, skip=(), condition_at=()),
     )  # fmt: skip
-    config = replace(config, skinning=skinning, prefit_steps=2)
+    config = replace(config, skinning=skinning, prefit_steps=2, settle_steps=0)
     drawn = fresh_fields(body, config)
     fitted = initial_fields(body, config, cache=tmp_path, verbose=False)
     settled = settle_on_person(body, fitted, np.zeros(10), config)
@@ -111,6 +111,55 @@ def test_without_the_surface_term_nothing_lays_the_weights_on_the_person(case):
         assert np.array_equal(a, b)
     moved = settle_on_person(body, fields, betas, config).skinning
     assert not eqx.tree_equal(moved, fields.skinning)
+
+
+@pytest.fixture(scope="module")
+def network(case):
+    """A network as drawn, a person, and the config for it."""
+    body, _, config, _, _ = case
+    skinning = replace(
+        config.skinning, kind="mlp", start="random",
+        mlp=MLPShape(width=32, depth=2, octaves=3, skip=(), condition_at=()),
+    )  # fmt: skip
+    config = replace(config, skinning=skinning, settle_steps=60)
+    return body, fresh_fields(body, config), np.full(10, 1.5), config
+
+
+def weight_error(body, fields, betas):
+    """Mean over vertices of what differs from the body's weights, all bones together."""
+    found = jax.jit(jax.vmap(fields.skinning))(canonical_vertices(body, betas))
+    return np.abs(np.asarray(found) - np.asarray(body.weights)).sum(1).mean()
+
+
+def test_a_network_is_settled_on_the_person(network):
+    body, fields, betas, config = network
+    settled = settle_on_person(body, fields, betas, config)
+    assert weight_error(body, settled, betas) < 0.7 * weight_error(body, fields, betas)
+    # What a joint asks for is the half of either bone, which a fresh network has not.
+    assert weight_error(body, fields, betas) > 1.5
+    # Geometry has no part in it: but for its joints, which are the person's from the start.
+    assert eqx.tree_equal(settled.geometry.biases, fields.geometry.biases)
+    assert eqx.tree_equal(settle_on_person(body, fields, betas, config), settled)
+
+
+def test_settling_has_no_surface_in_the_ablation_without_it(network):
+    """A4: joints alone teach the weights, so that the surface learns less."""
+    body, fields, betas, config = network
+    settled = settle_on_person(body, fields, betas, config)
+    alone = settle_on_person(body, fields, betas, ABLATIONS["A4"](config))
+    assert not eqx.tree_equal(alone.skinning, fields.skinning)
+    assert weight_error(body, alone, betas) > 1.1 * weight_error(body, settled, betas)
+
+
+@pytest.mark.parametrize("change", [{"settle_steps": 0}, {"learned": False}])
+def test_weights_that_are_kept_do_not_settle(change, network):
+    body, fields, betas, config = network
+    if "learned" in change:
+        config = replace(config, skinning=replace(config.skinning, **change))
+    else:
+        config = replace(config, **change)
+    kept = settle_on_person(body, fields, betas, config)
+    assert eqx.tree_equal(kept.skinning, fields.skinning)
 
 
 def test_stored_roots_of_a_random_field_are_refused(case):

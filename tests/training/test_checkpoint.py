@@ -81,6 +81,21 @@ def interrupt_at(step):
     return callback
 
 
+def test_a_run_with_a_guide_goes_on_with_the_one_it_had(job, tmp_path):
+    """Stopped at step 4 with the guide of step 3, on which its searches still run."""
+    call, _, config = job
+    search = replace(config.search, cached=False, guide_every=3, max_steps=8)
+    config = replace(config, steps=8, search=search)
+    done = call(config=config)
+    assert len(done.history.validated) > 1
+    file = tmp_path / "run.npz"
+    with pytest.raises(Interrupted):
+        call(config=config, checkpoint=file, callback=interrupt_at(4))
+    resumed = call(config=config, checkpoint=file, resume=True)
+    assert same(done.avatar.fields, resumed.avatar.fields)
+    assert resumed.history.validation == done.history.validation
+
+
 def test_a_stopped_run_goes_on_bit_for_bit(job, whole, tmp_path, monkeypatch):
     call, _, _ = job
     whole, folder, _ = whole

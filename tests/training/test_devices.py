@@ -59,14 +59,19 @@ def run(preset, frames_per_step, held):
         }
     return result
 
-both = {"quick": run(xa.quick(), 4, 1), "paper": run(xa.paper(), 2, 0)}
-print("RESULT", json.dumps(both))
+search = replace(xa.quick().search, cached=False, guide_every=2)
+found = {
+    "quick": run(xa.quick(), 4, 1),
+    "paper": run(xa.paper(), 2, 0),
+    "guided": run(replace(xa.quick(), search=search), 2, 1),
+}
+print("RESULT", json.dumps(found))
 """
 
 
 @pytest.fixture(scope="module")
 def results(case, tmp_path_factory) -> dict:
-    """Losses of both presets in a process that sees four devices."""
+    """Losses of both presets, and of searches with a guide, in a process that sees four devices."""
     pool, here = case[4], Path(__file__).parent
     file = tmp_path_factory.mktemp("pool") / "pool.npz"
     leaves = {f.name: getattr(pool, f.name) for f in fields(pool) if f.name != "params"}
@@ -88,7 +93,11 @@ def results(case, tmp_path_factory) -> dict:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "mesh"),
-    [("quick", {"frames": 4, "points": 1}), ("paper", {"frames": 2, "points": 2})],
+    [
+        ("quick", {"frames": 4, "points": 1}),
+        ("paper", {"frames": 2, "points": 2}),
+        ("guided", {"frames": 2, "points": 2}),
+    ],
 )
 def test_four_devices_give_the_losses_of_one(results, preset, mesh):
     """With stored roots, and with roots that each device searches for its own points."""

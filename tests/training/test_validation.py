@@ -141,7 +141,7 @@ def test_validation_is_the_loss_of_the_fields_at_their_roots(case, judged):
     target = 1 / (1 + np.exp(-scaled))
     expected = (entropy(logit, target) - entropy(scaled, target)).mean()
     # Points are drawn with repetition: a sample of as many as there are.
-    assert float(ask(fields, pool)) == pytest.approx(expected, rel=0.15)
+    assert float(ask(fields, pool, None)) == pytest.approx(expected, rel=0.15)
 
 
 def test_a_plateau_ends_training(case):

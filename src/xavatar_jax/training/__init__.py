@@ -25,10 +25,10 @@ from .loop import subject_betas as subject_betas
 from .model import AvatarFields as AvatarFields
 from .model import as_dtype as as_dtype
 from .model import fresh_fields as fresh_fields
-from .model import settle_on_person as settle_on_person
 from .model import trainable_filter as trainable_filter
 from .objective import ExtraTerms as ExtraTerms
 from .objective import Term as Term
 from .prefit import initial_fields as initial_fields
 from .run import Callback as Callback
 from .run import Fitted as Fitted
+from .settle import settle_on_person as settle_on_person

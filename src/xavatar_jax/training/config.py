@@ -60,11 +60,14 @@ class SearchConfig:
     - `starts`: which bones start a point's search.
     - `cached`: search once on the tabulated field when points are drawn, and polish the
       roots by Newton steps now and then; else search inside every training step.
+    - `guide_every`: a search inside the step runs on a table of the field first, which is made
+      anew every so many steps; its roots are moved to the field's own (0: on the field at once).
     - `grid`: the grids of the tabulated search; `keep`: roots kept a point; `atol`: metres.
     """
 
     starts: StartSet = "part_aware"
     cached: bool = True
+    guide_every: int = 0
     grid: GridSpacing = GridSpacing()
     keep: int = 3
     atol: float = 1e-5
@@ -143,6 +146,8 @@ class FitConfig:
     - `redraw_every`, `redraw_frames`: every so many steps the points of so many frames are drawn
       anew, one frame after another (0: never).
     - `prefit_steps`: steps that fit the geometry to the body's mean shape first, cached.
+    - `settle_steps`: steps that then teach the skinning field what its own terms ask for at the
+      person's joints and surface, before any root is searched. A template on grids has it already.
     - `report_every`: steps after which terms are recorded, and log and callback are served.
     - `checkpoint_every`: steps after which a checkpoint is written, where one is asked for.
     """
@@ -161,6 +166,7 @@ class FitConfig:
     redraw_every: int = 0
     redraw_frames: int = 8
     prefit_steps: int = 200
+    settle_steps: int = 500
     report_every: int = 25
     checkpoint_every: int = 250
     points: SamplingPlan = SamplingPlan()
@@ -203,6 +209,7 @@ def paper() -> FitConfig:
         frames_per_step=4,
         points_per_step=6000,
         prefit_steps=2000,
+        settle_steps=0,
         checkpoint_every=1000,
         points=SamplingPlan(),
         skinning=SkinningConfig(kind="mlp"),
@@ -232,6 +239,11 @@ def for_programs(config: FitConfig) -> FitConfig:
 
 PRESETS = {"quick": quick, "paper": paper}
 """Presets by name: functions that give a `FitConfig`."""
+
+
+def has_guide(config: FitConfig) -> bool:
+    """Whether searches run on a table of the skinning field first."""
+    return not config.search.cached and config.search.guide_every > 0
 
 
 def check_start(config: FitConfig) -> None:

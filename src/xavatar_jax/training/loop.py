@@ -22,13 +22,14 @@ from .config import FitConfig, check_start
 from .devices import ONE_DEVICE, Devices, share_work
 from .history import History
 from .log import JsonLines
-from .model import AvatarFields, settle_on_person
+from .model import AvatarFields
 from .objective import ExtraTerms, check_terms
 from .pool import FramePool, centred, find_roots, label_frames
 from .prefit import initial_fields
 from .progress import progress
 from .redraw import Redraw
 from .run import Callback, Fitted, Run
+from .settle import settle_on_person
 from .validation import split_validation
 
 
@@ -86,7 +87,7 @@ def fit_fields(
     if fields is None:
         initial = initial_fields(body, config, cache=cache, verbose=verbose)
         clock = history.lap("prefit", started)
-        start = settle_on_person(body, initial, betas, config)
+        start = settle_on_person(body, initial, betas, config, verbose=verbose)
     else:
         initial = start = fields
         clock = history.lap("prefit", started)

@@ -42,7 +42,7 @@ def fresh_fields(
 ) -> AvatarFields:
     """Fields before anything was fitted: a function of body, config and seed.
 
-    They know the mean shape alone; with `betas`, as `settle_on_person` leaves them.
+    They know the mean shape alone; with `betas`, as `lay_on_person` leaves them.
     """
     key_skinning, key_geometry = _keys(config)
     if config.skinning.kind == "mlp":
@@ -129,10 +129,10 @@ def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGe
     )
 
 
-def settle_on_person(
+def lay_on_person(
     body: BodyModel, fields: AvatarFields, betas: Float[np.ndarray, " S"], config: FitConfig
 ) -> AvatarFields:
-    """Lay grid fields around the person's own canonical body: the first act of training.
+    """Grid fields around the person's own canonical body instead of the mean shape's.
 
     The surface term of the objective asks for the template's weights at the person's canonical
     vertices (X-Avatar, section 3.4, which takes the subject's mean shape there). On grids that

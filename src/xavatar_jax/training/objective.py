@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..body import FACE, HANDS, BodyModel, canonical_joints, canonical_vertices
 from ..correspondence import Broyden, implicit_root, search_field, start_table
+from ..fields import AbstractSkinningField, TabulatedSkinning, pose_grid
 from ..kinematics import KinematicTree
 from ..losses import binary_cross_entropy, soft_occupancy, squared_error
 from ..sampling import bone_points, joint_targets
@@ -95,7 +96,7 @@ def geometry_objective(
         "occupancy": _divergence(logit, batch.distance, config).mean(),
         "bone": _bone_term(fields, anchors, conditions, key),
     }
-    return _weighted(terms, config), terms
+    return weighted(terms, config), terms
 
 
 def skinning_objective(
@@ -110,9 +111,9 @@ def skinning_objective(
     entropy = jnp.where(regular, _divergence(logit, batch.distance, config), 0.0)
     terms = {
         "occupancy": entropy.sum() / jnp.maximum(regular.sum(), 1),
-        **_weight_terms(fields, anchors, config, key),
+        **weight_terms(fields.skinning, anchors, config, key),
     }
-    return _weighted(terms, config), {f"skinning_{name}": term for name, term in terms.items()}
+    return weighted(terms, config), {f"skinning_{name}": term for name, term in terms.items()}
 
 
 def full_objective(
@@ -122,12 +123,15 @@ def full_objective(
     config: FitConfig,
     key: PRNGKeyArray,
     *,
+    guide: TabulatedSkinning | None = None,
     devices: Devices = ONE_DEVICE,
 ) -> tuple[Float[Array, ""], Terms]:
     """All terms, with roots searched on the fields themselves (X-Avatar, eq. 9 to 12)."""
     conditions = jax.vmap(fields.geometry.condition)(batch.params)
     roots, valid = devices.apart(
-        lambda fields, batch: search_batch(fields, batch, config, anchors.tree), fields, batch
+        lambda known, batch: search_batch(known[0], known[1], batch, config, anchors.tree),
+        (fields.skinning, guide),
+        batch,
     )
     chosen, found = jax.vmap(_best_root, in_axes=(None, 0, 0, 0))(fields, roots, valid, conditions)
     logit, regular = _logit_through_root(fields, chosen, batch, conditions)
@@ -137,12 +141,13 @@ def full_objective(
     terms = {
         "occupancy": entropy.sum() / jnp.maximum(use.sum(), 1),
         "bone": _bone_term(fields, anchors, conditions, bone_key),
-        **_weight_terms(fields, anchors, config, surface_key),
+        **weight_terms(fields.skinning, anchors, config, surface_key),
     }
-    return _weighted(terms, config), {**terms, "found": found.mean()}
+    return weighted(terms, config), {**terms, "found": found.mean()}
 
 
-def _weighted(terms: Terms, config: FitConfig) -> Float[Array, ""]:
+def weighted(terms: Terms, config: FitConfig) -> Float[Array, ""]:
+    """The sum of terms, each with its weight in the config."""
     losses = config.losses
     weights = {
         "occupancy": 1.0,
@@ -175,19 +180,19 @@ def _bone_term(
     return binary_cross_entropy(logit, jnp.ones_like(logit)).mean()
 
 
-def _weight_terms(
-    fields: AvatarFields, anchors: Anchors, config: FitConfig, key: PRNGKeyArray
+def weight_terms(
+    skinning: AbstractSkinningField, anchors: Anchors, config: FitConfig, key: PRNGKeyArray
 ) -> Terms:
     """At a joint its two bones share; at the body's surface the template's weights hold."""
     where, hot = joint_targets(anchors.tree)
-    at_joints = jax.vmap(fields.skinning)(anchors.joints)
+    at_joints = jax.vmap(skinning)(anchors.joints)
     surface, wanted = anchors.surface, anchors.weights
     if config.losses.surface_points:
         pick = jax.random.randint(key, (config.losses.surface_points,), 0, len(surface))
         surface, wanted = surface[pick], wanted[pick]
     return {
         "joint": squared_error(at_joints[where], jnp.asarray(hot)).mean(),
-        "surface": squared_error(jax.vmap(fields.skinning)(surface), wanted).mean(),
+        "surface": squared_error(jax.vmap(skinning)(surface), wanted).mean(),
     }
 
 
@@ -238,11 +243,15 @@ def _best_stored(
 
 
 def search_batch(
-    fields: AvatarFields, batch: Batch, config: FitConfig, tree: KinematicTree
+    skinning: AbstractSkinningField,
+    guide: TabulatedSkinning | None,
+    batch: Batch,
+    config: FitConfig,
+    tree: KinematicTree,
 ) -> tuple[Float[Array, "B M K 3"], Bool[Array, "B M K"]]:
-    """Roots of every point, searched on the field itself, inside the training step."""
+    """Roots of every point, searched inside the training step: the field's own, guide or not."""
     starts = start_table(tree, config.search.starts)
-    skinning = jax.lax.stop_gradient(fields.skinning)
+    skinning = jax.lax.stop_gradient(skinning)
     solver = Broyden(atol=config.search.atol, divergence=1.0)
     keep = min(config.search.keep, starts.width)
 
@@ -251,6 +260,7 @@ def search_batch(
             skinning,
             *frame,
             starts,
+            guide=None if guide is None else pose_grid(guide, frame[-1]),
             solver=solver,
             keep=keep,
             max_steps=config.search.max_steps,

@@ -16,6 +16,7 @@ from ..correspondence import ClosedFormNewton, StartTable, search_grid, start_ta
 from ..fields import (
     AbstractSkinningField,
     GridSkinning,
+    PartGrids,
     TabulatedSkinning,
     body_part_grids,
     pose_grid,
@@ -132,19 +133,24 @@ def _bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "T J 4
     return jax.vmap(lambda p: bone_transforms(body, p))(params)
 
 
-_tabulate = eqx.filter_jit(tabulate)
+tabulate_on = eqx.filter_jit(tabulate)
+
+
+def grids_for_search(
+    body: BodyModel, betas: Any, skinning: AbstractSkinningField, config: FitConfig
+) -> PartGrids:
+    """Grids around the person's canonical body; of a grid field, its own."""
+    if isinstance(skinning, GridSkinning):
+        return skinning.grids
+    vertices = np.asarray(canonical_vertices(body, jnp.asarray(betas)), np.float64)
+    return body_part_grids(body, vertices, config.search.grid)
 
 
 def tabulate_for_search(
     body: BodyModel, betas: Any, skinning: AbstractSkinningField, config: FitConfig
 ) -> TabulatedSkinning:
-    """The field on grids around the person's canonical body; a grid field on its own grids."""
-    if isinstance(skinning, GridSkinning):
-        grids = skinning.grids
-    else:
-        vertices = np.asarray(canonical_vertices(body, jnp.asarray(betas)), np.float64)
-        grids = body_part_grids(body, vertices, config.search.grid)
-    return _tabulate(skinning, grids)
+    """The field on these grids."""
+    return tabulate_on(skinning, grids_for_search(body, betas, skinning, config))
 
 
 def find_roots(

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -16,9 +17,10 @@ from jaxtyping import Int
 
 from .._version import __version__
 from ..body import BodyModel
+from ..fields import PartGrids, TabulatedSkinning
 from .budget import Pace
 from .checkpoint import Keeper
-from .config import FitConfig, config_to_dict
+from .config import FitConfig, config_to_dict, has_guide
 from .devices import Devices
 from .errors import Interrupted, TrainingError
 from .history import History
@@ -26,7 +28,7 @@ from .interrupt import StopFlag, stop_between_steps
 from .log import JsonLines
 from .model import AvatarFields
 from .objective import ExtraTerms, make_anchors
-from .pool import FramePool, polish_roots, tabulate_for_search
+from .pool import FramePool, grids_for_search, polish_roots, tabulate_on
 from .progress import progress
 from .redraw import Redraw, put_rows
 from .step import make_steps, with_learned
@@ -93,7 +95,7 @@ class Run:
         self.best = Best()
         self.latest: dict[str, Any] = {}
         self.at = 0
-        self.validation_s = 0.0
+        self.validation_s = self.guide_s = 0.0
         saved = None if keeper is None else keeper.saved
         if saved is not None:
             self.best = saved.best(state.learned)
@@ -108,12 +110,18 @@ class Run:
         if deadline is not None and not history.planned and config.optimiser.schedule == "cosine":
             self.pace = Pace(config.skinning_every if "skinning" in self.steps else 1, deadline)
         self.state, self.pool = devices.replicate(state), devices.replicate(pool)
+        self.guide = self._tabulated(state.guide) if has_guide(config) else None
         self.began, self.trained = self.at, history.seconds.get("train", 0.0)
         self.compiled: set[str] = set()
         self.unchecked: tuple[int, dict[str, Any]] | None = None
         if redraw is not None:
             redraw.begin(self.at)
         self._write({"event": "start" if saved is None else "resume", **self._head()})
+
+    @cached_property
+    def grids(self) -> PartGrids:
+        """Where the skinning field is tabulated."""
+        return grids_for_search(self.body, self.betas, self.start.skinning, self.config)
 
     @property
     def total(self) -> int:
@@ -153,7 +161,7 @@ class Run:
         fresh = name not in self.compiled
         if fresh:
             self._book("train")
-        self.state, terms = self.steps[name](self.state, self.pool)
+        self.state, terms = self.steps[name](self.state, self.pool, self.guide)
         self.at += 1
         previous, self.unchecked = self.unchecked, (self.at, terms)
         self._check(previous)
@@ -169,6 +177,7 @@ class Run:
         if self.pace is not None:
             self._plan(self.pace, bar)
         polished = "skinning" in self.steps and k % config.polish_every == 0
+        guided = self.guide is not None and k % config.search.guide_every == 0
         validated = self.validation is not None and k % config.validation.every == 0
         reported = k % self.config.report_every == 0
         redrawn = 0 if self.redraw is None or k >= config.steps else self.redraw.round_at(k)
@@ -178,6 +187,8 @@ class Run:
             self._take_redrawn(redrawn)
         if polished:
             self._polish()
+        if guided:
+            self._renew_guide()
         if validated:
             self._validate()
         reason = self._reason(flag)
@@ -223,6 +234,10 @@ class Run:
                     clock = time.perf_counter()
                     self._ask()
                     self.validation_s = time.perf_counter() - clock
+                if self.guide is not None:
+                    clock = time.perf_counter()
+                    jax.block_until_ready(self._tabulated(self.state.guide))
+                    self.guide_s = time.perf_counter() - clock
                 self._book("compile")
                 pace.start()
             return
@@ -230,6 +245,7 @@ class Run:
             return
         self._settle()
         extra = self.validation_s / self.config.validation.every
+        extra += self.guide_s / max(self.config.search.guide_every, 1)
         most = self.at + self.devices.least(pace.steps_left(extra))
         self.history.planned = min(most, self.config.steps)
         total = self.devices.replicate(jnp.asarray(self.total, jnp.int32))
@@ -241,15 +257,29 @@ class Run:
     def _ask(self) -> float:
         """The loss on the validation frames."""
         assert self.validation is not None
-        return float(self.validation(eqx.combine(self.state.learned, self.base), self.pool))
+        fields = eqx.combine(self.state.learned, self.base)
+        return float(self.validation(fields, self.pool, self.guide))
 
     def _polish(self) -> None:
         """Let stored roots follow the skinning field; on one device, for it is little work."""
         skinning = self.devices.collect(with_learned(self.base, self.state).skinning)
-        table = tabulate_for_search(self.body, self.betas, skinning, self.config)
+        table = tabulate_on(skinning, self.grids)
         # Since the last time roots have moved so little that one step leaves micrometres.
         pool = polish_roots(skinning, table, self.devices.collect(self.pool), steps=1)
         self.pool = self.devices.replicate(pool)
+
+    def _tabulated(self, learned: Any) -> TabulatedSkinning:
+        """The skinning field with these leaves as a guide, on every device."""
+        skinning = eqx.combine(self.devices.collect(learned), self.start.skinning)
+        return self.devices.replicate(tabulate_on(skinning, self.grids))
+
+    def _renew_guide(self) -> None:
+        """Let the guide follow the skinning field, and keep of what: a run that goes on asks."""
+        own = jax.tree.map(jnp.copy, self.state.learned.skinning)
+        self.state = eqx.tree_at(lambda s: s.guide, self.state, own)
+        self._book("train")
+        self.guide = jax.block_until_ready(self._tabulated(own))
+        self._book("guide")
 
     def _take_redrawn(self, number: int) -> None:
         """Replace the points of a few frames, and let the next ones be made."""

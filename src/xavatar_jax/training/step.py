@@ -14,8 +14,9 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from ..fields import TabulatedSkinning
 from .batch import Batch
-from .config import FitConfig, for_programs
+from .config import FitConfig, for_programs, has_guide
 from .devices import ONE_DEVICE, Devices
 from .model import AvatarFields, trainable_filter
 from .objective import (
@@ -32,16 +33,20 @@ from .pool import FramePool
 class TrainState(eqx.Module):
     """What a step changes: learned leaves, an optimiser state for each field, steps done.
 
-    `total`: the step at which a falling rate is at its end.
+    `total`: the step at which a falling rate is at its end; `guide`: the learned leaves of the
+    skinning field as the guide of the searches has it, if they have one.
     """
 
     learned: AvatarFields
     optimisers: dict[str, Any]
     step: Int[Array, ""]
     total: Int[Array, ""]
+    guide: Any = None
 
 
-Step = Callable[[TrainState, FramePool], tuple[TrainState, dict[str, Array]]]
+Step = Callable[
+    [TrainState, FramePool, TabulatedSkinning | None], tuple[TrainState, dict[str, Array]]
+]
 
 
 def make_optimiser(config: FitConfig) -> optax.GradientTransformation:
@@ -145,8 +150,9 @@ def make_steps(
     devices: Devices = ONE_DEVICE,
     terms: ExtraTerms | None = None,
 ) -> tuple[TrainState, dict[str, Step]]:
-    """The first state, and the jitted steps `(state, pool) -> (state, terms)` by what they learn.
+    """The first state, and the jitted steps by what they learn.
 
+    A step is `(state, pool, guide) -> (state, terms)`; `guide` is None unless `has_guide(config)`.
     With stored roots there is one for "geometry" and, if it is learned, one for "skinning"; with
     roots searched in the step one for "both"; `terms` are added to each. Draws are keyed by seed
     and step number alone, and leave out the pool's last `held` frames. A step whose loss or
@@ -162,15 +168,17 @@ def make_steps(
     read = for_programs(config)
 
     def bind(plan: _Plan) -> Step:
-        return lambda state, pool: _step(
-            (pool, anchors, fixed_arrays, dict(terms or {})), state, static, plan, read, devices
+        return lambda state, pool, guide: _step(
+            (pool, guide, anchors, fixed_arrays, dict(terms or {})),
+            *(state, static, plan, read, devices),
         )
 
     for plan in _plans(pool, config, held):
         optimisers[plan.name] = make_optimiser(config).init(_own(learned, plan.name))
         steps[plan.name] = bind(plan)
     at, total = jnp.zeros((), jnp.int32), jnp.asarray(config.steps, jnp.int32)
-    return TrainState(learned, optimisers, at, total), steps
+    guide = jax.tree.map(jnp.copy, learned.skinning) if has_guide(config) else None
+    return TrainState(learned, optimisers, at, total, guide), steps
 
 
 @dataclass(frozen=True)
@@ -228,20 +236,20 @@ def _at_rates(updates: Any, name: str, config: FitConfig, left: Array) -> Any:
 # Made once: a second run of the same shapes and options does not compile again.
 @eqx.filter_jit(donate="all-except-first")
 def _step(
-    constant: tuple[FramePool, Anchors, Any, ExtraTerms],
+    constant: tuple[FramePool, TabulatedSkinning | None, Anchors, Any, ExtraTerms],
     state: TrainState,
     static: Any,
     plan: _Plan,
     config: FitConfig,
     devices: Devices,
 ) -> tuple[TrainState, dict[str, Array]]:
-    pool, anchors, fixed_arrays, extra = constant
+    pool, guide, anchors, fixed_arrays, extra = constant
     name = plan.name
     prefix = "skinning_" if name == "skinning" else ""
     objective = {
         "geometry": geometry_objective,
         "skinning": skinning_objective,
-        "both": partial(full_objective, devices=devices),
+        "both": partial(full_objective, guide=guide, devices=devices),
     }[name]
     objective = with_extra(objective, extra, prefix)
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
@@ -260,7 +268,7 @@ def _step(
     updates = _at_rates(updates, name, config, rate_factor(config, state.step, state.total))
     learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
     optimisers = {**state.optimisers, name: optimiser_state}
-    after = TrainState(learned, optimisers, state.step + 1, state.total)
+    after = TrainState(learned, optimisers, state.step + 1, state.total, state.guide)
     size = optax.tree.norm(gradient)
     good = jnp.isfinite(total) & jnp.isfinite(size)
     after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..fields import TabulatedSkinning
 from ..frames import Frames, spread
 from .config import FitConfig, ValidationConfig, for_programs
 from .model import AvatarFields
@@ -43,8 +45,8 @@ def split_validation(
 
 def make_validation(
     pool: FramePool, anchors: Anchors, config: FitConfig, held: int
-) -> Callable[[AvatarFields, FramePool], Float[Array, ""]]:
-    """A function of fields and pool: the occupancy term on the pool's last `held` frames.
+) -> Callable[[AvatarFields, FramePool, TabulatedSkinning | None], Float[Array, ""]]:
+    """A function of fields, pool and guide: the occupancy term on the last `held` frames.
 
     Points are the same in every call. Where roots are stored, they are polished on the fields'
     own skinning; else they are searched.
@@ -52,13 +54,16 @@ def make_validation(
     count = min(config.validation.points, pool.points.shape[1])
     several = rows_with_several(pool, count) if config.search.cached else 0
     read = for_programs(config)
-    return lambda fields, pool: _loss(fields, pool, anchors, read, held, count, several)
+    return lambda fields, pool, guide: _loss(
+        fields, pool, guide, anchors, read, held, count, several
+    )
 
 
 @eqx.filter_jit
 def _loss(
     fields: AvatarFields,
     pool: FramePool,
+    guide: TabulatedSkinning | None,
     anchors: Anchors,
     config: FitConfig,
     held: int,
@@ -68,7 +73,7 @@ def _loss(
     chosen = jnp.arange(pool.points.shape[0] - held, pool.points.shape[0])
     several_key, single_key, key = jax.random.split(jax.random.key(_KEY), 3)
     batch = batch_of(pool, chosen, count, several, several_key, single_key)
-    objective = skinning_objective if config.search.cached else full_objective
+    objective = skinning_objective if config.search.cached else partial(full_objective, guide=guide)
     name = "skinning_occupancy" if config.search.cached else "occupancy"
     return objective(fields, batch, anchors, config, key)[1][name]
 
