@@ -57,9 +57,10 @@ def setting_config(setting: str, minutes: float) -> FitConfig:
         points_per_step=500,
         frames_per_minute=30,
         prefit_steps=4000 if start == "template" else config.prefit_steps,
-        settle_steps=1000,
+        settle_steps=4000,
         skinning=replace(config.skinning, kind="mlp", start=start),
         search=replace(config.search, cached=False, guide_every=50),
+        losses=replace(config.losses, surface_points=512),
         optimiser=replace(config.optimiser, skinning_rate=1e-3),
         validation=replace(config.validation, share=0.0),
     )
@@ -67,7 +68,7 @@ def setting_config(setting: str, minutes: float) -> FitConfig:
 
 def small(config: FitConfig) -> FitConfig:
     """The same in a minute or so, to see that it runs."""
-    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=20, settle_steps=20)
+    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=60, settle_steps=20)
 
 
 def for_steps(config: FitConfig, steps: int) -> FitConfig:

@@ -166,7 +166,7 @@ class FitConfig:
     redraw_every: int = 0
     redraw_frames: int = 8
     prefit_steps: int = 200
-    settle_steps: int = 500
+    settle_steps: int = 2000
     report_every: int = 25
     checkpoint_every: int = 250
     points: SamplingPlan = SamplingPlan()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,8 @@ from .model import AvatarFields, lay_on_person, trainable_filter
 from .objective import Anchors, make_anchors, weight_terms, weighted
 from .progress import progress
 from .step import cosine, make_optimiser
+
+_POINTS = 256  # of the surface, a step: more of them teach a network less in the same time
 
 
 def settle_on_person(
@@ -44,7 +47,7 @@ def settle_on_person(
     fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
     state = make_optimiser(config).init(learned)
     constant = (anchors, fixed_arrays)
-    read = for_programs(config)
+    read = for_programs(replace(config, losses=replace(config.losses, surface_points=_POINTS)))
     with progress("weights", config.settle_steps, verbose=verbose, unit="step") as bar:
         for k in range(config.settle_steps):
             done = jnp.asarray(k / config.settle_steps)
