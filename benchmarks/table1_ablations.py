@@ -5,8 +5,7 @@ the body's bones (A1) or at all bones (A2), if points are drawn without regard t
 if nothing holds the weights at the surface (A4)? And if the template's weights are kept as they
 are?
 
-Every row is a run of `xa.fit` of so many minutes from its call, on the bundled capture; with
-`--steps`, of so many steps, whatever they take. Settings:
+Every row is a run of `xa.fit` of so many minutes from its call, on the bundled capture. Settings:
 
 - `quick`: the preset, with roots that are found once and polished.
 - `mlp`: the paper's skinning network, fitted to the mean shape's weights first; roots are searched
@@ -30,7 +29,6 @@ from search_problems import least_time
 
 import xavatar_jax as xa
 from xavatar_jax.training import ABLATIONS, FitConfig, initial_fields
-from xavatar_jax.training.budget import frames_in_budget
 from xavatar_jax.training.config import has_guide
 from xavatar_jax.training.objective import search_batch
 from xavatar_jax.training.pool import label_frames, tabulate_for_search
@@ -71,11 +69,6 @@ def small(config: FitConfig) -> FitConfig:
     return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=60, settle_steps=20)
 
 
-def for_steps(config: FitConfig, steps: int) -> FitConfig:
-    """The same frames and so many steps, whatever they take."""
-    return replace(config, train_frames=frames_in_budget(config), minutes=None, steps=steps)
-
-
 def change(config: FitConfig, name: str) -> FitConfig:
     """The config with one thing changed."""
     if name == "fixed":
@@ -104,8 +97,6 @@ def measure(
 ) -> dict[str, Any]:
     """Figures of one run."""
     config = setting_config(setting, args.minutes)
-    if args.steps:
-        config = for_steps(config, args.steps)
     config = change(small(config) if args.quick else config, name)
     config = replace(config, seed=seed)
     # The first fields are the same for all, and are not what is compared: they are made before.
@@ -158,7 +149,6 @@ def main() -> None:
     add_options(parser, NAMES, minutes=3)
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, metavar="NAME", help="of "
                         + ", ".join(SETTINGS))  # fmt: skip
-    parser.add_argument("--steps", type=int, help="of a run, in place of minutes")
     args = parser.parse_args()
     if args.quick:
         args.eval_frames, args.seeds = 1, 1
@@ -174,8 +164,7 @@ def main() -> None:
         question="the paper's ablations at equal time",
         settings={
             "quick": args.quick,
-            "minutes": None if args.steps else args.minutes,
-            "steps": args.steps,
+            "minutes": args.minutes,
             "eval_frames": args.eval_frames,
             "data": capture.name,
         },

@@ -42,8 +42,7 @@ SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
 BORDERS = "part_borders.json"
 FLOOR = "metric_floor.json"
 MEMORY = "memory.json"
-TABLE1, TABLE1_STEPS = "table1_ablations.json", "table1_equal_steps.json"
-TABLE2, CURVE = "table2_grab.json", "accuracy_over_time.json"
+TABLE1, TABLE2, CURVE = "table1_ablations.json", "table2_grab.json", "accuracy_over_time.json"
 REGIONS = ("all", "hands", "face")
 NOT_MEASURED = "Not measured yet for this version."
 
@@ -451,8 +450,7 @@ def medians_view(
         for row in sorted(medians(record["rows"], by), key=lambda row: row.get("minutes", 0)):
             rows.append([*(f"{row[name]}" for name in shown), *_cells(row, columns)])
         header = record["header"]
-        given = {name: header[name] for name in ("minutes", "steps") if header.get(name)}
-        budget = "".join(f", {value:g} {name} a run" for name, value in given.items())
+        budget = f", {header['minutes']:g} minutes a run" if "minutes" in header else ""
         return (
             f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['eval_frames']} held-out "
             f"frames{budget}; medians over seeds."
@@ -544,7 +542,6 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{FLOOR}": floor_view,
     f"docs/figures/{MEMORY}": memory_view,
     f"docs/figures/{TABLE1}": medians_view(("setting", "name"), _ABLATION_COLUMNS),
-    f"docs/figures/{TABLE1_STEPS}": medians_view(("setting", "name"), _ABLATION_COLUMNS),
     f"docs/figures/{TABLE2}": medians_view(("name",), _METHOD_COLUMNS),
     f"docs/figures/{CURVE}": medians_view(("name", "minutes"), _CURVE_COLUMNS),
 }
@@ -610,7 +607,6 @@ _STORED = {
     "metric_floor": FLOOR,
     "memory": MEMORY,
     "table1": TABLE1,
-    "table1_steps": TABLE1_STEPS,
     "table2": TABLE2,
     "curve": CURVE,
 }
@@ -631,7 +627,6 @@ def main() -> None:
     parser.add_argument("--metric-floor", help="JSON of benchmarks/metric_floor.py")
     parser.add_argument("--memory", help="JSON of benchmarks/memory.py")
     parser.add_argument("--table1", help="JSON of benchmarks/table1_ablations.py")
-    parser.add_argument("--table1-steps", help="the same with --steps")
     parser.add_argument("--table2", help="JSON of benchmarks/table2_grab.py")
     parser.add_argument("--curve", help="JSON of benchmarks/accuracy_over_time.py")
     args = parser.parse_args()

@@ -135,7 +135,7 @@ def test_a_network_is_settled_on_the_person(network):
     body, fields, betas, config = network
     settled = settle_on_person(body, fields, betas, config)
     assert weight_error(body, settled, betas) < 0.7 * weight_error(body, fields, betas)
-    # What a joint asks for is the half of either bone, which a fresh network has not.
+    # As drawn, nearly all of a vertex's weight is with bones that it should not be with.
     assert weight_error(body, fields, betas) > 1.5
     # Geometry has no part in it: but for its joints, which are the person's from the start.
     assert eqx.tree_equal(settled.geometry.biases, fields.geometry.biases)

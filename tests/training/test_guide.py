@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from xavatar_jax.training.config import has_guide
+from xavatar_jax.training.loop import train_pool
 from xavatar_jax.training.model import trainable_filter
 from xavatar_jax.training.objective import search_batch
 from xavatar_jax.training.pool import tabulate_for_search
@@ -57,17 +58,23 @@ def test_roots_are_the_fields_own_whatever_the_guide_shows(guided, stale):
     assert (gap[plain_valid] < 1e-3).mean() > 0.98
 
 
-def test_the_guide_is_that_of_the_last_round(guided, case, monkeypatch):
-    """Made from the start, and anew after every fourth step."""
-    body, fields, _, _, config = guided
-    shown = []
+@pytest.fixture
+def shown(monkeypatch):
+    """Steps at which a guide was made, each with the leaves that it was made of."""
+    made = []
     tabulated = Run._tabulated
 
     def look(self, learned):
-        shown.append((self.at, jax.tree.map(np.array, learned)))
+        made.append((self.at, jax.tree.map(np.array, learned)))
         return tabulated(self, learned)
 
     monkeypatch.setattr(Run, "_tabulated", look)
+    return made
+
+
+def test_the_guide_is_that_of_the_last_round(guided, case, shown):
+    """Made from the start, and anew after every fourth step."""
+    body, fields, _, _, config = guided
     seen = {}
     train(body, fields, case[4], replace(config, steps=10, report_every=1), seen)
     assert [at for at, _ in shown] == [0, 4, 8]
@@ -76,9 +83,14 @@ def test_the_guide_is_that_of_the_last_round(guided, case, monkeypatch):
         assert eqx.tree_equal(jax.tree.map(np.array, own), learned)
 
 
-def train(body, fields, pool, config, seen):
-    from xavatar_jax.training.loop import train_pool
+def test_a_field_that_is_not_learned_is_tabulated_once(guided, case, shown):
+    body, fields, _, _, config = guided
+    kept = replace(config.skinning, learned=False)
+    train(body, fields, case[4], replace(config, steps=9, skinning=kept), {})
+    assert [at for at, _ in shown] == [0]
 
+
+def train(body, fields, pool, config, seen):
     train_pool(
         body, fields, pool, np.zeros(10), config, verbose=False,
         callback=lambda step, fields, terms: seen.update({step: fields}),

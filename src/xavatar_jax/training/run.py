@@ -124,6 +124,11 @@ class Run:
         return grids_for_search(self.body, self.betas, self.start.skinning, self.config)
 
     @property
+    def guide_moves(self) -> bool:
+        """Whether there is a guide, of a field that changes."""
+        return self.guide is not None and self.config.skinning.learned
+
+    @property
     def total(self) -> int:
         """Steps that there will be, if nothing ends the run before."""
         return min(self.history.planned or self.config.steps, self.config.steps)
@@ -177,11 +182,11 @@ class Run:
         if self.pace is not None:
             self._plan(self.pace, bar)
         polished = "skinning" in self.steps and k % config.polish_every == 0
-        guided = self.guide is not None and k % config.search.guide_every == 0
+        guided = self.guide_moves and k % config.search.guide_every == 0
         validated = self.validation is not None and k % config.validation.every == 0
         reported = k % self.config.report_every == 0
         redrawn = 0 if self.redraw is None or k >= config.steps else self.redraw.round_at(k)
-        if polished or validated or redrawn:
+        if polished or guided or validated or redrawn:
             self._settle()
         if redrawn:
             self._take_redrawn(redrawn)
@@ -234,7 +239,7 @@ class Run:
                     clock = time.perf_counter()
                     self._ask()
                     self.validation_s = time.perf_counter() - clock
-                if self.guide is not None:
+                if self.guide_moves:
                     clock = time.perf_counter()
                     jax.block_until_ready(self._tabulated(self.state.guide))
                     self.guide_s = time.perf_counter() - clock

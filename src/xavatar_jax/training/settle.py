@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float
 
 from ..body import BodyModel
@@ -75,4 +74,4 @@ def _step(
 
     updates, state = make_optimiser(config).update(jax.grad(loss)(learned), state, learned)
     rate = config.optimiser.learning_rate * cosine(done)
-    return optax.apply_updates(learned, jax.tree.map(lambda u: -rate * u, updates)), state
+    return eqx.apply_updates(learned, jax.tree.map(lambda u: -rate * u, updates)), state
