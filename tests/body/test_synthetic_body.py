@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -411,6 +413,26 @@ def test_extraction_is_deterministic():
     second = extract(Person(), leaf_size, BODY_BOX)
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_hands_are_the_same_bits_on_every_processor():
+    """OpenBLAS takes other code on other processors, and sums in another order there."""
+    code = (
+        "import hashlib\n"
+        "from xavatar_jax.body.synthetic.hands import hand_basis, relaxed_hand\n"
+        "print(hashlib.sha256(hand_basis().tobytes() + relaxed_hand().tobytes()).hexdigest())"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "OPENBLAS_CORETYPE": kernel},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        ).stdout
+        for kernel in ("Haswell", "SkylakeX", "Prescott")
+    }
+    assert len(found) == 1
 
 
 def test_interrupted_writing_leaves_nothing(tmp_path, monkeypatch):
