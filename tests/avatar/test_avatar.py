@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import CellSizes
@@ -21,6 +22,17 @@ def test_fit_learns_the_person(run):
     assert after.cd_mm.hands < 1.5
     assert after.iou.all > 0.95
     assert after.cd_mm.all < 0.5 * before.cd_mm.all
+
+
+def test_the_range_heard_is_that_of_the_frames_learned_from(run):
+    geometry = run.fit.avatar.fields.geometry
+    pose = np.asarray(run.fit.frames.params.pose)
+    turned = Rotation.from_rotvec(pose.reshape(-1, 3)).as_matrix() - np.eye(3)
+    turned = turned.reshape(*pose.shape[:2], 9)
+    turned[:, 0] = 0
+    expected = np.stack([turned.min(0).clip(max=0), turned.max(0).clip(min=0)])
+    np.testing.assert_allclose(geometry.pose_range, expected, atol=1e-6)
+    assert not np.asarray(geometry.expression_range).any()
 
 
 def test_quiet_fit_prints_nothing(run, capsys):

@@ -156,6 +156,35 @@ def test_the_condition_is_local_and_blind_to_the_root(bundled_body, vertices, lo
     assert elbow[away > 6 * reach].max() < 1e-6
 
 
+def test_nothing_is_heard_beyond_what_frames_have_shown(bundled_body, loud, rng):
+    """A knee that bent to one radian is heard as bent so far at two; toes that lay still, not."""
+    names = bundled_body.tree
+    knee, toes = names.index("left_knee"), names.index("left_foot")
+
+    def condition(field, *, bend=0.0, curl=0.0, smile=0.0):
+        pose = np.zeros((55, 3))
+        pose[knee, 0], pose[toes, 0] = bend, curl
+        expression = np.r_[smile, np.zeros(9)]
+        return field.condition(params_of(bundled_body, pose=pose, expression=expression))
+
+    shown = np.zeros((20, 55, 3))
+    shown[:, knee, 0] = np.linspace(0.2, 1.0, 20)
+    smiles = np.zeros((20, 10))
+    smiles[:, 0] = np.linspace(0.5, 0.8, 20)
+    frames = jax.vmap(lambda p, e: params_of(bundled_body, pose=p, expression=e))(shown, smiles)
+    field = loud.within(frames)
+    for seen in ({"bend": 0.0}, {"bend": 0.6, "smile": 0.3}, {"bend": 1.0, "smile": 0.8}):
+        for a, b in zip(condition(field, **seen), condition(loud, **seen), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+    for a, b in zip(
+        condition(field, bend=2.0, curl=-0.6, smile=5.0),
+        condition(loud, bend=1.0, smile=0.8),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    assert np.abs(condition(loud, curl=-0.6).joints[toes]).max() > 0.1
+
+
 def test_expressions_are_read_trilinearly_and_fade_out(rng):
     """Linear functions of the place are given exactly, away from the edge of the box."""
     low, high = np.array([-0.1, 0.2, 0.0]), np.array([0.1, 0.5, 0.22])

@@ -95,7 +95,8 @@ def _kept(fields: AvatarFields, avatar: Avatar) -> AvatarFields:
     """Leaves that the file holds: all learned ones, whether or not this run has learned them."""
     kept = trainable_filter(fields, avatar.config)
     if isinstance(fields.geometry, HashGeometry):
-        kept = eqx.tree_at(lambda f: f.geometry.joints, kept, True)
+        told = (True,) * len(fields.geometry.told)
+        kept = eqx.tree_at(lambda f: f.geometry.told, kept, told)
     return eqx.filter(fields, kept)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -35,6 +35,13 @@ class AbstractGeometryField(eqx.Module):
     def at(self, points: Float[Array, "N 3"]) -> AbstractFixedPoints:
         """The field at points that stay, for many conditions: what can be kept is kept."""
         return FixedPoints(self, points)
+
+    def within(self, params: BodyParams) -> Self:
+        """The field when it is to learn from frames with these parameters, batched.
+
+        A field may keep what range they have, and hear nothing beyond it.
+        """
+        return self
 
     def audible(self, condition: Any) -> Any:
         """A condition without what is silent in it: the same logits, sooner.
@@ -98,6 +105,10 @@ class HashGeometry(AbstractGeometryField):
     joint over half the length of the bones that meet there. Expression reaches the face alone, by
     an `ExpressionGrid` in its box. Levels finer than the trunk needs are heard inside the boxes
     of `detail` alone.
+
+    Entries of rotations and coefficients of expression beyond what `within` was told are heard as
+    the nearest that are not: what noise teaches about a joint that hardly moved would be
+    multiplied by the angle that it turns by later.
     """
 
     encoding: HashEncoding
@@ -106,6 +117,8 @@ class HashGeometry(AbstractGeometryField):
     pose_weights: Float[Array, "J 9 K"]
     expressive: ExpressionGrid | None
     joints: Float[Array, "J 3"]
+    pose_range: Float[Array, "2 J 9"]
+    expression_range: Float[Array, "2 E"]
     reach: tuple[float, ...] = eqx.field(static=True)
     detail_low: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
     detail_high: tuple[tuple[float, float, float], ...] = eqx.field(static=True)
@@ -145,6 +158,9 @@ class HashGeometry(AbstractGeometryField):
         self.pose_weights = jnp.zeros((tree.num_joints, 9, condition_width))
         self.expressive = expressive
         self.joints = jnp.asarray(joints, jnp.float32)
+        known = 0 if expressive is None else expressive.table.shape[1]
+        self.pose_range = _everything(tree.num_joints, 9)
+        self.expression_range = _everything(known)
         self.reach = _joint_reach(tree, joints)
         self.detail_low = _triples([box[0] for box in detail])
         self.detail_high = _triples([box[1] for box in detail])
@@ -155,14 +171,27 @@ class HashGeometry(AbstractGeometryField):
 
     def condition(self, params: BodyParams) -> LocalCondition:
         """A row for each joint, so that a point's condition is its nearness times these rows."""
-        rotations = axis_angle_to_matrix(params.pose)
-        feature = (rotations - jnp.eye(3, dtype=rotations.dtype)).reshape(-1, 9).at[0].set(0)
-        rows = jnp.einsum("jf,jfk->jk", feature, self.pose_weights)
+        pose = _clipped(_turned(params.pose), self.pose_range)
+        rows = jnp.einsum("jf,jfk->jk", pose, self.pose_weights)
         # A motion may have fewer coefficients than the person's capture had, or more.
-        known = 0 if self.expressive is None else self.expressive.table.shape[1]
+        known = self.expression_range.shape[1]
         given = params.expression[:known]
-        expression = jnp.pad(given, (0, known - len(given)))
+        expression = _clipped(jnp.pad(given, (0, known - len(given))), self.expression_range)
         return LocalCondition(rows, *self._around_joints(rows.dtype), expression)
+
+    def within(self, params: BodyParams) -> Self:
+        known = self.expression_range.shape[1]
+        given = jnp.asarray(params.expression)[:, :known]
+        shown = (
+            _range(jax.vmap(_turned)(jnp.asarray(params.pose))),
+            _range(jnp.pad(given, ((0, 0), (0, known - given.shape[1])))),
+        )
+        return eqx.tree_at(lambda g: (g.pose_range, g.expression_range), self, shown)
+
+    @property
+    def told(self) -> tuple[Array, ...]:
+        """Leaves that are the person's and the frames', and never learned."""
+        return self.joints, self.pose_range, self.expression_range
 
     def at(self, points: Float[Array, "N 3"]) -> FixedHash:
         features = jax.vmap(self._features)(points)
@@ -224,6 +253,29 @@ class HashGeometry(AbstractGeometryField):
             inside = jnp.clip(depth / 0.02, 0, 1)
             mask = jnp.maximum(mask, inside * jnp.asarray(spacing >= finest * 0.999, x.dtype))
         return mask
+
+
+def _turned(pose: Float[Array, "J 3"]) -> Float[Array, "J 9"]:
+    """Rotations less the identity; none of the root's."""
+    rotations = axis_angle_to_matrix(pose)
+    return (rotations - jnp.eye(3, dtype=rotations.dtype)).reshape(-1, 9).at[0].set(0)
+
+
+def _everything(*shape: int) -> Float[Array, "2 *shape"]:
+    return jnp.stack([jnp.full(shape, -jnp.inf), jnp.full(shape, jnp.inf)])
+
+
+def _range(values: Float[Array, "F *shape"]) -> Float[Array, "2 *shape"]:
+    """Least and most of each entry; silence, which fields know from the start, is among them."""
+    found = jnp.stack([jnp.minimum(values.min(0), 0), jnp.maximum(values.max(0), 0)])
+    return found.astype(jnp.float32)
+
+
+def _clipped(
+    values: Float[Array, "*shape"], bounds: Float[Array, "2 *shape"]
+) -> Float[Array, "*shape"]:
+    low, high = jax.lax.stop_gradient(bounds).astype(values.dtype)
+    return jnp.clip(values, low, high)
 
 
 def _nearness(

@@ -91,6 +91,8 @@ def fit_fields(
     else:
         initial = start = fields
         clock = history.lap("prefit", started)
+    geometry = start.geometry.within(frames[learned].params)
+    start = AvatarFields(start.skinning, geometry)
     clock = history.lap("settle", clock)
     pool = None
     if keeper is not None and keeper.saved is not None:

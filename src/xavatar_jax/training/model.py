@@ -158,7 +158,8 @@ def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
         frozen = jax.tree.map(lambda _: False, fields.skinning)
         learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
     if isinstance(fields.geometry, HashGeometry):
-        learned = eqx.tree_at(lambda f: f.geometry.joints, learned, False)
+        told = (False,) * len(fields.geometry.told)
+        learned = eqx.tree_at(lambda f: f.geometry.told, learned, told)
     return learned
 
 

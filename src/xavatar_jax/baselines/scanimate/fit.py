@@ -98,7 +98,7 @@ def fit_scanimate(
         clock = history.lap(name, clock)
     hands = static_hands(whole, frames.params, betas) if config.hands == "body" else None
     canonical = _canonical(nets, scans, hands, config)
-    geometry = _hears(fields.geometry, nets.forward)
+    geometry = _hears(fields.geometry.within(learned_from.params), nets.forward)
     clock = history.lap("canonical", clock)
     geometry = _run(
         "shape",
