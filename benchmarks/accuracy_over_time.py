@@ -8,24 +8,28 @@ budget decides more than where a run is cut off: its frames, its schedule. The f
 `paper` are made before, as are body and capture; evaluation does not count.
 
     python benchmarks/accuracy_over_time.py --json curve.json --picture curve.png [--only NAME...]
+
+The runs of table 2 are points of the curve, too: `--table2 FILE` takes them from there.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 from methods import METHODS, learn
-from resumable import Row, add_options, every, fill, medians, score
+from resumable import Row, add_options, every, fill, medians, rows_of, score
 
 import xavatar_jax as xa
 from xavatar_jax.render import grid_picture, save_png
-from xavatar_jax.report import line_chart
+from xavatar_jax.report import describe_machine, line_chart
 
-MINUTES = (1.0, 1.5, 2.0, 4.0, 7.0, 10.0, 20.0, 30.0)
+MINUTES = (1.0, 1.5, 3.0, 4.0, 10.0, 30.0)
 NAMES = ("quick", "paper", "SNARF", "SCANimate")
 
 
@@ -35,6 +39,16 @@ def measure(
     """Figures of one run."""
     model, spent = learn(name, capture, minutes, seed, small=args.quick, cache=args.cache_dir)
     return {**spent, **score(model, capture.test, args.eval_frames)}
+
+
+def points_of_table2(file: str, settings: Mapping[str, Any]) -> list[Row]:
+    """The runs of that table, with their minutes.
+
+    **Raises:** `ValueError` if they are of other settings or of another machine.
+    """
+    rows = rows_of(Path(file), {**describe_machine(), **settings}, ("device", "cores", *settings))
+    minutes = json.loads(Path(file).read_text(encoding="utf-8"))["header"]["minutes"]
+    return [{**row, "minutes": minutes} for row in rows if row["name"] in NAMES]
 
 
 def picture(rows: Sequence[Row], minutes: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:
@@ -56,19 +70,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Accuracy against minutes.")
     add_options(parser, METHODS, minutes=MINUTES, seeds=1)
     parser.add_argument("--picture", help="draw the curves into this PNG")
+    parser.add_argument("--table2", help="JSON of table2_grab.py: its runs are not made again")
     args = parser.parse_args()
     if args.quick:
         args.eval_frames, args.minutes = 1, [1.0]
     names = args.only or (("quick",) if args.quick else NAMES)
     capture = xa.synthetic_capture(args.cache_dir)
+    settings = {"quick": args.quick, "eval_frames": args.eval_frames, "data": capture.name}
     _, rows = fill(
         every(seed=range(args.seeds), name=names, minutes=args.minutes),
         lambda **job: measure(**job, capture=capture, args=args),
         question="held-out accuracy against minutes since the call of fit",
-        settings={"quick": args.quick, "eval_frames": args.eval_frames, "data": capture.name},
+        settings=settings,
         file=args.json,
         by=("name", "minutes"),
         columns=("cd_all_mm", "cd_hands_mm", "cd_face_mm", "fit_s", "steps"),
+        known=points_of_table2(args.table2, settings) if args.table2 else (),
     )
     if args.picture:
         save_png(args.picture, picture(rows, args.minutes))

@@ -66,13 +66,15 @@ def fill(
     file: str | Path | None,
     by: Sequence[str] = ("name",),
     columns: Sequence[str] = (),
+    known: Sequence[Row] = (),
 ) -> tuple[dict[str, Any], list[Row]]:
     """Header and rows of the table: `run(**job)` for each job that the file does not have yet.
 
     `settings` are what all rows share (minutes, frames): a file with others, or of another
-    machine, is refused. A run that fails is reported, and left for the next call; the others go
-    on. Every run begins with nothing compiled, so that none has the advantage of coming later.
-    At the end the medians are printed: see `print_medians` for `by` and `columns`.
+    machine, is refused. `known` are rows of runs made elsewhere, which are not made again. A run
+    that fails is reported, and left for the next call; the others go on. Every run begins with
+    nothing compiled, so that none has the advantage of coming later. At the end the medians are
+    printed: see `print_medians` for `by` and `columns`.
 
     **Raises:** `ValueError` naming the file and what differs; `SystemExit` at the end if a run
     failed.
@@ -81,6 +83,7 @@ def fill(
     rows: list[Row] = []
     if file is not None and Path(file).exists():
         rows = rows_of(Path(file), header, ("device", "cores", "question", *settings))
+    rows += [row for row in known if row not in rows]
     failed = []
     for k, job in enumerate(jobs):
         label = ", ".join(str(v) if k == "name" else f"{k} {v}" for k, v in job.items())

@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             "quick": args.quick,
             "minutes": args.minutes,
             "eval_frames": eval_frames,
-            "capture": capture.name,
+            "data": capture.name,
         },
         file=args.json,
         columns=COLUMNS,

@@ -40,10 +40,10 @@ def table(resumable, tmp_path):
         made.append((name, seed))
         return {"cd_mm": float(ord(name) + seed**2), "said": "yes", "nothing": float("nan")}
 
-    def fill(jobs=jobs, **settings):
+    def fill(jobs=jobs, known=(), **settings):
         return resumable.fill(
             jobs, run, question="?", settings={"minutes": 3.0, **settings},
-            file=tmp_path / "table.json",
+            file=tmp_path / "table.json", known=known,
         )  # fmt: skip
 
     return fill, made, bad, tmp_path / "table.json"
@@ -68,6 +68,18 @@ def test_a_table_goes_on_where_it_stopped(table, capsys):
     printed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["name", "seeds", "cd_mm", "row_s"] in printed
     assert ["a", "3", "98"] in [words[:3] for words in printed]  # 97, 98, 101
+
+
+def test_runs_known_from_elsewhere_are_not_made_again(table):
+    fill, made, _, file = table
+    known = [{"name": "b", "seed": 1, "cd_mm": 5.0}, {"name": "c", "seed": 0, "cd_mm": 6.0}]
+    for _ in range(2):
+        _, rows = fill(known=known)
+        assert len(made) == 5
+        assert ("b", 1) not in made
+        assert len(rows) == 6
+        assert [r["cd_mm"] for r in rows if (r["name"], r["seed"]) == ("b", 1)] == [5.0]
+        assert len(json.loads(file.read_text())["rows"]) == 7
 
 
 def test_medians_are_over_seeds(resumable):
