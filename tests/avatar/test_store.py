@@ -2,11 +2,15 @@
 
 import json
 import shutil
+from dataclasses import replace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import xavatar_jax as xa
+from xavatar_jax.body import canonical_params
 from xavatar_jax.files import load_arrays, save_arrays
 
 
@@ -25,6 +29,19 @@ def test_round_trip_gives_the_same_mesh(run, saved):
     assert again.steps == run.config.steps
 
 
+def test_round_trip_keeps_what_expressions_do(run, tmp_path):
+    heard = jnp.stack([jnp.full(10, -1.0), jnp.full(10, 1.0)])
+    fields = eqx.tree_at(lambda f: f.geometry.expression_range, run.fit.avatar.fields, heard)
+    avatar = replace(run.fit.avatar, fields=fields)
+    avatar.save(tmp_path / "avatar.npz")
+    again = xa.load_avatar(tmp_path / "avatar.npz", body=run.body)
+    neutral = canonical_params(run.body)
+    smile = replace(neutral, expression=jnp.asarray([1.0, *9 * [0.0]]))
+    vertices = again.mesh(smile).vertices
+    assert np.array_equal(vertices, avatar.mesh(smile).vertices)
+    assert np.abs(vertices - avatar.mesh(neutral).vertices).max() > 0.002
+
+
 def test_body_is_found_by_its_path(run, saved):
     assert xa.load_avatar(saved).body.source == run.body.source
 
@@ -36,6 +53,7 @@ def test_file_holds_nothing_of_the_body(run, saved):
     for name, value in arrays.items():
         assert run.body.num_vertices not in value.shape, name
         assert grids.num_nodes not in value.shape, name
+        assert "moves" not in name
     assert header["body"]["checksum"] == run.body.source.checksum
     json.dumps(header, allow_nan=False)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,13 +11,21 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from xavatar_jax.body import BodyParams, canonical_joints
+from xavatar_jax.body import (
+    FACES,
+    BodyParams,
+    canonical_expression_dirs,
+    canonical_joints,
+    canonical_params,
+    pose_body,
+)
 from xavatar_jax.fields import (
     ExpressionGrid,
     GridSpacing,
     HashGeometry,
     body_part_grids,
     mean_canonical_vertices,
+    template_expression,
     template_grid_skinning,
     template_weights,
 )
@@ -46,6 +56,33 @@ def test_weights_off_the_surface_are_those_of_the_nearest(bundled_body, vertices
     _, nearest = cKDTree(vertices).query(points)
     close = np.abs(found - np.asarray(bundled_body.weights)[nearest]).max(1)
     assert np.median(close) < 0.02  # a vertex spacing away at most
+
+
+def test_expression_moves_the_face_as_the_posed_body_does(bundled_body, vertices, rng):
+    """Against blend shapes under skinning, with joints that stay."""
+    still = replace(bundled_body, joint_expression_dirs=0 * bundled_body.joint_expression_dirs)
+    expression = rng.normal(size=10)
+    params = replace(canonical_params(still), expression=jnp.asarray(expression))
+    moved = np.asarray(pose_body(still, params).vertices) - vertices
+    moves = canonical_expression_dirs(bundled_body) @ expression
+    np.testing.assert_allclose(moves, moved, atol=1e-6)
+    grid = template_expression(bundled_body, vertices, 0.006, 10)
+    assert grid is not None
+    on_face = np.flatnonzero(np.isin(np.asarray(bundled_body.part_labels), FACES))
+    points = jnp.asarray(vertices[on_face], jnp.float32)
+    nodes = grid.under(jnp.asarray(expression, jnp.float32))
+    read = np.asarray(jax.vmap(lambda x: grid.read(nodes, x))(points))
+    away = np.linalg.norm(read - moved[on_face], axis=1)
+    assert np.linalg.norm(moved[on_face], axis=1).max() > 0.005
+    assert np.median(away) < 2e-4
+    assert np.quantile(away, 0.95) < 2e-3  # less than a cell away something else moves
+    assert not np.asarray(grid.read(nodes, jnp.asarray(vertices[0] - 1.0, jnp.float32))).any()
+
+
+def test_bodies_without_a_face_or_expression_move_nothing(bundled_body, vertices):
+    assert template_expression(bundled_body, vertices, 0.01, 0) is None
+    faceless = replace(bundled_body, part_labels=0 * np.asarray(bundled_body.part_labels))
+    assert template_expression(faceless, vertices, 0.01, 10) is None
 
 
 def test_grids_around_the_body(bundled_body, vertices, rng):

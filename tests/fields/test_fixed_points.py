@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import xavatar_jax as xa
-from xavatar_jax.body import canonical_vertices
-from xavatar_jax.fields import MLPShape
+from xavatar_jax.body import FACES, canonical_vertices
+from xavatar_jax.fields import MLPShape, mean_canonical_vertices, template_expression
 from xavatar_jax.training import fresh_fields
 
 
@@ -52,3 +52,30 @@ def test_fixed_points_give_the_field(bundled_body, kind, rng):
         tolerance = 1e-5 * float(jnp.abs(expected).max())
         np.testing.assert_allclose(fixed(condition), expected, atol=tolerance)
     assert np.abs(seen[2] - seen[0]).max() > 0.01
+
+
+def test_fixed_points_follow_the_expression(bundled_body, rng):
+    """Where they are carried, the field is what it would be in place if nothing moved."""
+    still = random_geometry(bundled_body, "hash")
+    vertices = mean_canonical_vertices(bundled_body)
+    moves = template_expression(bundled_body, vertices, 0.01, 10)
+    assert moves is not None
+    geometry = eqx.tree_at(lambda g: g.moves, still, moves, is_leaf=lambda x: x is None)
+    on_face = np.isin(np.asarray(bundled_body.part_labels), FACES)
+    points = jnp.asarray(vertices[on_face][::20], jnp.float32)
+    params = xa.BodyParams.create(
+        bundled_body, pose=0.5 * rng.normal(size=(55, 3)), expression=0.5 * rng.normal(size=10)
+    )
+    condition = geometry.condition(params)
+    fixed = geometry.at(points)
+    carried = fixed.carried(condition)
+    each = jax.vmap(lambda x: geometry.carry(x, condition))
+    np.testing.assert_allclose(carried, each(points), atol=1e-6)
+    assert np.abs(carried - points).max() > 0.002
+    expected = jax.vmap(lambda x: still(x, condition))(points)
+    np.testing.assert_allclose(fixed(condition), expected, atol=1e-5 * np.abs(expected).max())
+    # The field itself finds the place back by substitution.
+    back = jax.vmap(lambda x: geometry._carried_from(x, condition))(carried)
+    away = np.linalg.norm(back - points, axis=1)
+    assert np.quantile(away, 0.99) < 2e-4
+    assert np.quantile(away, 0.5) < 1e-5

@@ -298,9 +298,13 @@ _at = eqx.filter_jit(lambda fields, points: fields.geometry.at(points))
 
 @eqx.filter_jit
 def offset_vertices(base: PosableBase, condition: Any) -> Float[Array, "3 V"]:
-    """The base on the surface of one condition, to first order: a step along its own normal."""
+    """The base on the surface of one condition, to first order: a step along its own normal.
+
+    From where the condition carries it.
+    """
     away = base.logits(condition) / base.slopes
-    return base.vertices - base.normals * jnp.clip(away, -_LARGEST_STEP, _LARGEST_STEP)
+    carried = base.logits.carried(condition).T
+    return carried - base.normals * jnp.clip(away, -_LARGEST_STEP, _LARGEST_STEP)
 
 
 @eqx.filter_jit

@@ -37,7 +37,10 @@ def gradients(fields: AvatarFields, points: Array, condition: Any) -> Array:
 
 @eqx.filter_jit
 def project(fields: AvatarFields, points: Array, condition: Any) -> Array:
-    """Move points on to the level set by Newton steps along the gradient, 3 mm a step at most."""
+    """Move places of the neutral surface on to a condition's, from where it carries them.
+
+    By Newton steps along the gradient, 3 mm a step at most.
+    """
 
     def value(x: Array) -> Array:
         return fields.geometry(x, condition)
@@ -47,7 +50,10 @@ def project(fields: AvatarFields, points: Array, condition: Any) -> Array:
         slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
         return x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
 
-    return jax.vmap(lambda x: jax.lax.fori_loop(0, 3, step, x))(points)
+    def one(x: Array) -> Array:
+        return jax.lax.fori_loop(0, 3, step, fields.geometry.carry(x, condition))
+
+    return jax.vmap(one)(points)
 
 
 @eqx.filter_jit

@@ -17,6 +17,7 @@ from .model import BodyModel as BodyModel
 from .model import BodySource as BodySource
 from .model import Posed as Posed
 from .model import bone_transforms as bone_transforms
+from .model import canonical_expression_dirs as canonical_expression_dirs
 from .model import canonical_joints as canonical_joints
 from .model import canonical_params as canonical_params
 from .model import canonical_pose as canonical_pose

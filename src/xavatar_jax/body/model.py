@@ -183,6 +183,19 @@ def canonical_joints(body: BodyModel, betas: Float[Array, " S"]) -> Float[Array,
 
 
 @eqx.filter_jit
+def canonical_expression_dirs(body: BodyModel) -> Float[Array, "V 3 E"]:
+    """Where each coefficient of expression moves a vertex in the canonical pose, metres.
+
+    The directions turn with the bones; joints stay, as in `bone_transforms`.
+    """
+    rotations = relative_transforms(
+        body.tree, axis_angle_to_matrix(canonical_pose(body)), body.joint_template
+    )[:, :3, :3]
+    turn = jnp.einsum("vj,jab->vab", body.weights, rotations, precision=_PRECISION)
+    return jnp.einsum("vab,vbe->vae", turn, body.expression_dirs, precision=_PRECISION)
+
+
+@eqx.filter_jit
 def bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "J 4 4"]:
     """Transforms of every bone from canonical space to one posed frame, translation included.
 

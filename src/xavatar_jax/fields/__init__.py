@@ -30,5 +30,6 @@ from .skinning import tabulate as tabulate
 from .template import body_part_grids as body_part_grids
 from .template import mean_canonical_vertices as mean_canonical_vertices
 from .template import random_grid_skinning as random_grid_skinning
+from .template import template_expression as template_expression
 from .template import template_grid_skinning as template_grid_skinning
 from .template import template_weights as template_weights

@@ -41,6 +41,14 @@ class ExpressionGrid(eqx.Module):
         self.spacing, self.shape = spacing, (x, y, z)
         self.table = jnp.zeros((x * y * z, num_expression, features))
 
+    @property
+    def nodes(self) -> Float[np.ndarray, "N 3"]:
+        """Places of the nodes, metres, in the order of the table."""
+        axes = [
+            low + self.spacing * np.arange(n) for low, n in zip(self.low, self.shape, strict=True)
+        ]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
     def __call__(self, x: Float[Array, "3"]) -> Float[Array, "E K"]:
         rows, share = self._around(x)
         return jnp.einsum("c,cek->ek", share, self.table[rows])

@@ -20,6 +20,9 @@ from .fixed import AbstractFixedPoints, FixedHash, FixedPoints
 from .mlp import ImplicitMLP, MLPShape
 from .softplus import softplus
 
+# Of the search for the place that an expression has moved to a point.
+_SUBSTITUTIONS = 3
+
 
 class AbstractGeometryField(eqx.Module):
     """An occupancy logit in canonical space, conditioned on a frame's pose and expression."""
@@ -32,8 +35,15 @@ class AbstractGeometryField(eqx.Module):
     def __call__(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, ""]:
         """Logit at `x_c` (metres, canonical space) under one frame's condition."""
 
+    def carry(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, "3"]:
+        """Where a place of the neutral person goes under a condition, if the field was told.
+
+        Its surface is sought from there. A field that was told nothing leaves it where it is.
+        """
+        return x_c
+
     def at(self, points: Float[Array, "N 3"]) -> AbstractFixedPoints:
-        """The field at points that stay, for many conditions: what can be kept is kept."""
+        """The field at points, for many conditions that carry them: what can be kept is kept."""
         return FixedPoints(self, points)
 
     def within(self, params: BodyParams) -> Self:
@@ -106,6 +116,10 @@ class HashGeometry(AbstractGeometryField):
     an `ExpressionGrid` in its box. Levels finer than the trunk needs are heard inside the boxes
     of `detail` alone.
 
+    Where the body model's own expression moves places of the face (`moves`), the field is that of
+    the place which is moved to the point: a smile carries the corners of a mouth over centimetres,
+    further than the features of one place could follow. What is left is learned.
+
     Entries of rotations and coefficients of expression beyond what `within` was told are heard as
     the nearest that are not: what noise teaches about a joint that hardly moved would be
     multiplied by the angle that it turns by later.
@@ -116,6 +130,7 @@ class HashGeometry(AbstractGeometryField):
     biases: tuple[Float[Array, " out"], ...]
     pose_weights: Float[Array, "J 9 K"]
     expressive: ExpressionGrid | None
+    moves: ExpressionGrid | None
     joints: Float[Array, "J 3"]
     pose_range: Float[Array, "2 J 9"]
     expression_range: Float[Array, "2 E"]
@@ -157,6 +172,7 @@ class HashGeometry(AbstractGeometryField):
         # Silent at first: the start is the same surface in every pose.
         self.pose_weights = jnp.zeros((tree.num_joints, 9, condition_width))
         self.expressive = expressive
+        self.moves = None
         self.joints = jnp.asarray(joints, jnp.float32)
         known = 0 if expressive is None else expressive.table.shape[1]
         self.pose_range = _everything(tree.num_joints, 9)
@@ -193,6 +209,26 @@ class HashGeometry(AbstractGeometryField):
         """Leaves that are the person's and the frames', and never learned."""
         return self.joints, self.pose_range, self.expression_range
 
+    def carry(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
+        if self.moves is None or not len(condition.expression):
+            return x_c
+        return x_c + self.moves.read(self._moved_nodes(condition), x_c)
+
+    def _carried_from(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
+        """The place that `carry` takes to `x_c`, by a few rounds of substitution."""
+        if self.moves is None or not len(condition.expression):
+            return x_c
+        nodes, x = self._moved_nodes(condition), x_c
+        for _ in range(_SUBSTITUTIONS):
+            x = x_c - self.moves.read(nodes, x)
+        return x
+
+    def _moved_nodes(self, condition: LocalCondition) -> Float[Array, "N 3"]:
+        # Under `vmap` over points the nodes are summed once, not for each of them.
+        assert self.moves is not None
+        moves = jax.lax.stop_gradient(self.moves)
+        return moves.under(condition.expression.astype(moves.table.dtype))
+
     def at(self, points: Float[Array, "N 3"]) -> FixedHash:
         features = jax.vmap(self._features)(points)
         width = self.encoding.width
@@ -202,6 +238,8 @@ class HashGeometry(AbstractGeometryField):
             first=first + bias,
             nearness=jax.vmap(lambda x: _nearness(x, *self._around_joints(x.dtype)))(points),
             expressive=None if self.expressive is None else jax.vmap(self.expressive)(points),
+            points=points,
+            moves=None if self.moves is None else jax.vmap(self.moves)(points),
             from_condition=weight[:, width:],
             hidden=self.hidden[1:],
             biases=self.biases[1:],
@@ -221,6 +259,7 @@ class HashGeometry(AbstractGeometryField):
 
     def __call__(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, ""]:
         joints, centres, fade, expression = condition
+        x_c = self._carried_from(x_c, condition)
         h = [self._features(x_c), _nearness(x_c, centres, fade) @ joints]
         if self.expressive is not None and len(expression):
             # Under `vmap` over points the nodes are summed once, not for each of them.

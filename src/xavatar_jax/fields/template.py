@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_vertices
+from ..body import (
+    FACES,
+    LEFT_HAND,
+    RIGHT_HAND,
+    BodyModel,
+    canonical_expression_dirs,
+    canonical_vertices,
+)
 from ..geometry import closest_points
+from .expression import ExpressionGrid
 from .grids import GridSpacing, PartGrids, build_part_grids
 from .hierarchical import hierarchical_logits, num_logits
 from .skinning import GridSkinning
+
+# Around the face, where its expression is told: it fades out over half of this.
+_FACE_MARGIN = 0.04
 
 
 def mean_canonical_vertices(body: BodyModel) -> Float[np.ndarray, "V 3"]:
@@ -43,6 +56,39 @@ def template_weights(
 
     `vertices` are the body's in the canonical pose, of any shape.
     """
+    return _from_surface(body, vertices, points) @ np.asarray(body.weights, np.float64)
+
+
+def template_expression(
+    body: BodyModel, vertices: Float[np.ndarray, "V 3"], spacing: float, num_expression: int
+) -> ExpressionGrid | None:
+    """How the body model's own expression moves canonical places of the face, metres.
+
+    On nodes around the canonical `vertices` of the face, by the closest point of the surface.
+    None for a body without a face, or without expression.
+    """
+    face = vertices[np.isin(np.asarray(body.part_labels), FACES)]
+    if not len(face) or not num_expression:
+        return None
+    grid = ExpressionGrid(
+        face.min(0) - _FACE_MARGIN,
+        face.max(0) + _FACE_MARGIN,
+        spacing=spacing,
+        num_expression=num_expression,
+        features=3,
+    )
+    moves = np.asarray(canonical_expression_dirs(body), np.float64)[..., :num_expression]
+    moves = moves.transpose(0, 2, 1).reshape(len(vertices), -1)
+    table = _from_surface(body, vertices, grid.nodes) @ moves
+    return eqx.tree_at(
+        lambda g: g.table, grid, jnp.asarray(table.reshape(grid.table.shape), jnp.float32)
+    )
+
+
+def _from_surface(
+    body: BodyModel, vertices: Float[np.ndarray, "V 3"], points: Float[np.ndarray, "N 3"]
+) -> Any:
+    """A sparse `(N, V)` that carries values at vertices to points, each from its closest place."""
     from scipy.sparse import csr_array
 
     faces = np.asarray(body.faces)
@@ -50,8 +96,7 @@ def template_weights(
     corners = faces[face]
     share = _barycentric(position, vertices[corners])
     ends = np.arange(0, 3 * len(points) + 1, 3)
-    carry = csr_array((share.ravel(), corners.ravel(), ends), (len(points), len(vertices)))
-    return carry @ np.asarray(body.weights, np.float64)
+    return csr_array((share.ravel(), corners.ravel(), ends), (len(points), len(vertices)))
 
 
 def template_grid_skinning(

@@ -34,7 +34,8 @@ class GeometryConfig:
 
     `spacing` is the node distance of each level in metres; levels finer than `trunk` are heard
     at hands (down to `hands`) and face (down to `face`) only. Expression is heard at the face, by
-    `expression_features` on a grid of `expression_spacing`.
+    `expression_features` on a grid of `expression_spacing`; nodes `expression_moves` apart know
+    how the body model's own expression moves the face, and the field follows (0: it does not).
     """
 
     kind: Literal["hash", "mlp"] = "hash"
@@ -48,6 +49,7 @@ class GeometryConfig:
     condition: int = 16
     expression_spacing: float = 0.012
     expression_features: int = 4
+    expression_moves: float = 0.008
     sharpness: float = 10.0
     box_margin: float = 0.25
     mlp: MLPShape = MLPShape()

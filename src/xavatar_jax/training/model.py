@@ -21,6 +21,7 @@ from ..fields import (
     MLPSkinning,
     mean_canonical_vertices,
     random_grid_skinning,
+    template_expression,
     template_grid_skinning,
 )
 from .config import FitConfig, GeometryConfig, SkinningConfig
@@ -52,7 +53,9 @@ def fresh_fields(
     else:
         skinning = _person_grids(body, betas, config)
     geometry = _geometry(body, config.geometry, key_geometry)
-    return AvatarFields(skinning, geometry if betas is None else _moved(geometry, body, betas))
+    if betas is not None:
+        geometry = _on_person(geometry, body, betas, config.geometry)
+    return AvatarFields(skinning, geometry)
 
 
 def _keys(config: FitConfig) -> Array:
@@ -78,12 +81,22 @@ def _moves_grids(config: FitConfig) -> bool:
     return config.losses.surface > 0 or config.skinning.start == "random"
 
 
-def _moved(geometry: AbstractGeometryField, body: BodyModel, betas: Any) -> AbstractGeometryField:
-    """A field whose condition is heard around the person's own joints."""
+def _on_person(
+    geometry: AbstractGeometryField, body: BodyModel, betas: Any, config: GeometryConfig
+) -> AbstractGeometryField:
+    """A field whose condition is heard around the person's own joints, and moves their own face."""
     if not isinstance(geometry, HashGeometry):
         return geometry
-    joints = canonical_joints(body, jnp.asarray(betas, body.template.dtype))
-    return eqx.tree_at(lambda g: g.joints, geometry, jnp.asarray(joints, jnp.float32))
+    betas = jnp.asarray(betas, body.template.dtype)
+    joints = jnp.asarray(canonical_joints(body, betas), jnp.float32)
+    moves = None
+    if config.expression_moves:
+        vertices = np.asarray(canonical_vertices(body, betas), np.float64)
+        known = geometry.expression_range.shape[1]
+        moves = template_expression(body, vertices, config.expression_moves, known)
+    return eqx.tree_at(
+        lambda g: (g.joints, g.moves), geometry, (joints, moves), is_leaf=lambda x: x is None
+    )
 
 
 def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGeometryField:
@@ -144,7 +157,8 @@ def lay_on_person(
     skinning = fields.skinning
     if isinstance(skinning, GridSkinning) and _moves_grids(config):
         skinning = _person_grids(body, betas, config)
-    return AvatarFields(skinning, _moved(fields.geometry, body, betas))
+    geometry = _on_person(fields.geometry, body, betas, config.geometry)
+    return AvatarFields(skinning, geometry)
 
 
 def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
@@ -160,6 +174,10 @@ def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
     if isinstance(fields.geometry, HashGeometry):
         told = (False,) * len(fields.geometry.told)
         learned = eqx.tree_at(lambda f: f.geometry.told, learned, told)
+        frozen = jax.tree.map(lambda _: False, fields.geometry.moves)
+        learned = eqx.tree_at(
+            lambda f: f.geometry.moves, learned, frozen, is_leaf=lambda x: x is None
+        )
     return learned
 
 
