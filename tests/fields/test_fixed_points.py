@@ -75,7 +75,7 @@ def test_fixed_points_follow_the_expression(bundled_body, rng):
     expected = jax.vmap(lambda x: still(x, condition))(points)
     np.testing.assert_allclose(fixed(condition), expected, atol=1e-5 * np.abs(expected).max())
     # The field itself finds the place back by substitution.
-    back = jax.vmap(lambda x: geometry._carried_from(x, condition))(carried)
+    back = jax.vmap(lambda x: geometry.carried_from(x, condition))(carried)
     away = np.linalg.norm(back - points, axis=1)
     assert np.quantile(away, 0.99) < 2e-4
     assert np.quantile(away, 0.5) < 1e-5

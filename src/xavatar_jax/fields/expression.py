@@ -54,7 +54,7 @@ class ExpressionGrid(eqx.Module):
         return jnp.einsum("c,cek->ek", share, self.table[rows])
 
     def under(self, expression: Float[Array, " E"]) -> Float[Array, "N K"]:
-        """The nodes' features under one expression, for `read`."""
+        """The nodes' features under one expression, for `read`: no work of any one point's."""
         return jnp.einsum("nek,e->nk", self.table, expression, precision=_EXACT)
 
     def read(self, nodes: Float[Array, "N K"], x: Float[Array, "3"]) -> Float[Array, " K"]:

@@ -210,24 +210,21 @@ class HashGeometry(AbstractGeometryField):
         return self.joints, self.pose_range, self.expression_range
 
     def carry(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
-        if self.moves is None or not len(condition.expression):
-            return x_c
-        return x_c + self.moves.read(self._moved_nodes(condition), x_c)
+        return x_c + self._moved(x_c, condition)
 
-    def _carried_from(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
+    def carried_from(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
         """The place that `carry` takes to `x_c`, by a few rounds of substitution."""
-        if self.moves is None or not len(condition.expression):
-            return x_c
-        nodes, x = self._moved_nodes(condition), x_c
+        x = x_c
         for _ in range(_SUBSTITUTIONS):
-            x = x_c - self.moves.read(nodes, x)
+            x = x_c - self._moved(x, condition)
         return x
 
-    def _moved_nodes(self, condition: LocalCondition) -> Float[Array, "N 3"]:
-        # Under `vmap` over points the nodes are summed once, not for each of them.
-        assert self.moves is not None
+    def _moved(self, x: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
+        """How far the expression moves a place, metres."""
+        if self.moves is None or not len(condition.expression):
+            return jnp.zeros_like(x)
         moves = jax.lax.stop_gradient(self.moves)
-        return moves.under(condition.expression.astype(moves.table.dtype))
+        return moves.read(moves.under(condition.expression.astype(moves.table.dtype)), x)
 
     def at(self, points: Float[Array, "N 3"]) -> FixedHash:
         features = jax.vmap(self._features)(points)
@@ -259,10 +256,9 @@ class HashGeometry(AbstractGeometryField):
 
     def __call__(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, ""]:
         joints, centres, fade, expression = condition
-        x_c = self._carried_from(x_c, condition)
+        x_c = self.carried_from(x_c, condition)
         h = [self._features(x_c), _nearness(x_c, centres, fade) @ joints]
         if self.expressive is not None and len(expression):
-            # Under `vmap` over points the nodes are summed once, not for each of them.
             nodes = self.expressive.under(expression)
             h.append(self.expressive.read(nodes, x_c))
         h = jnp.concatenate(h)
