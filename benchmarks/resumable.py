@@ -83,7 +83,13 @@ def fill(
     rows: list[Row] = []
     if file is not None and Path(file).exists():
         rows = rows_of(Path(file), header, ("device", "cores", "question", *settings))
-    rows += [row for row in known if row not in rows]
+
+    def keep(more: Sequence[Row]) -> None:
+        rows.extend(more)
+        if more and file is not None:
+            write_json(file, {"header": header, "rows": rows})
+
+    keep([row for row in known if row not in rows])
     failed = []
     for k, job in enumerate(jobs):
         label = ", ".join(str(v) if k == "name" else f"{k} {v}" for k, v in job.items())
@@ -102,10 +108,8 @@ def fill(
             continue
         spent = time.perf_counter() - clock
         row = {**job, **figures, "row_s": spent, "commit": header["commit"]}
-        rows.append({name: _plain(value) for name, value in row.items()})
         header["peak_rss_mb"] = describe_machine()["peak_rss_mb"]
-        if file is not None:
-            write_json(file, {"header": header, "rows": rows})
+        keep([{name: _plain(value) for name, value in row.items()}])
     rows = [row for row in rows if any(job.items() <= row.items() for job in jobs)]
     print(f"{header['device']}, {header['cores']} cores, commit {header['commit']}")
     print_medians(rows, by, columns)

@@ -73,6 +73,9 @@ def test_a_table_goes_on_where_it_stopped(table, capsys):
 def test_runs_known_from_elsewhere_are_not_made_again(table):
     fill, made, _, file = table
     known = [{"name": "b", "seed": 1, "cd_mm": 5.0}, {"name": "c", "seed": 0, "cd_mm": 6.0}]
+    fill(jobs=[{"name": "b", "seed": 1}], known=known)
+    assert not made
+    assert json.loads(file.read_text())["rows"] == known
     for _ in range(2):
         _, rows = fill(known=known)
         assert len(made) == 5
