@@ -95,8 +95,7 @@ def _kept(fields: AvatarFields, avatar: Avatar) -> AvatarFields:
     """Leaves that the file holds: all learned ones, whether or not this run has learned them."""
     kept = trainable_filter(fields, avatar.config)
     if isinstance(fields.geometry, HashGeometry):
-        told = (True,) * len(fields.geometry.told)
-        kept = eqx.tree_at(lambda f: f.geometry.told, kept, told)
+        kept = eqx.tree_at(lambda f: f.geometry.told, kept, replace_fn=lambda _: True)
     return eqx.filter(fields, kept)
 
 

@@ -189,20 +189,21 @@ class HashGeometry(AbstractGeometryField):
         """A row for each joint, so that a point's condition is its nearness times these rows."""
         pose = _clipped(_turned(params.pose), self.pose_range)
         rows = jnp.einsum("jf,jfk->jk", pose, self.pose_weights)
-        # A motion may have fewer coefficients than the person's capture had, or more.
-        known = self.expression_range.shape[1]
-        given = params.expression[:known]
-        expression = _clipped(jnp.pad(given, (0, known - len(given))), self.expression_range)
+        expression = _clipped(self._known(params.expression), self.expression_range)
         return LocalCondition(rows, *self._around_joints(rows.dtype), expression)
 
     def within(self, params: BodyParams) -> Self:
-        known = self.expression_range.shape[1]
-        given = jnp.asarray(params.expression)[:, :known]
         shown = (
             _range(jax.vmap(_turned)(jnp.asarray(params.pose))),
-            _range(jnp.pad(given, ((0, 0), (0, known - given.shape[1])))),
+            _range(jax.vmap(self._known)(jnp.asarray(params.expression))),
         )
         return eqx.tree_at(lambda g: (g.pose_range, g.expression_range), self, shown)
+
+    def _known(self, expression: Float[Array, " n"]) -> Float[Array, " E"]:
+        # A motion may have fewer coefficients than the person's capture had, or more.
+        count = self.expression_range.shape[1]
+        given = expression[:count]
+        return jnp.pad(given, (0, count - len(given)))
 
     @property
     def told(self) -> tuple[Array, ...]:

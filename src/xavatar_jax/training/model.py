@@ -172,11 +172,10 @@ def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
         frozen = jax.tree.map(lambda _: False, fields.skinning)
         learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
     if isinstance(fields.geometry, HashGeometry):
-        told = (False,) * len(fields.geometry.told)
-        learned = eqx.tree_at(lambda f: f.geometry.told, learned, told)
-        frozen = jax.tree.map(lambda _: False, fields.geometry.moves)
         learned = eqx.tree_at(
-            lambda f: f.geometry.moves, learned, frozen, is_leaf=lambda x: x is None
+            lambda f: (*f.geometry.told, *jax.tree.leaves(f.geometry.moves)),
+            learned,
+            replace_fn=lambda _: False,
         )
     return learned
 
