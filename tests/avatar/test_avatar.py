@@ -1,5 +1,7 @@
 """The avatar as a user meets it: meshes, occupancy, evaluation."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,6 +35,20 @@ def test_the_range_heard_is_that_of_the_frames_learned_from(run):
     expected = np.stack([turned.min(0).clip(max=0), turned.max(0).clip(min=0)])
     np.testing.assert_allclose(geometry.pose_range, expected, atol=1e-6)
     assert not np.asarray(geometry.expression_range).any()
+
+
+def test_a_face_smiles_as_the_body_does_although_no_frame_did(run):
+    neutral = replace(run.test[0].params, expression=jnp.zeros(10))
+    smile = replace(neutral, expression=jnp.asarray([2.0, *9 * [0.0]]))
+    before, after = (np.asarray(xa.pose_body(run.body, p).vertices) for p in (neutral, smile))
+    moved = np.linalg.norm(after - before, axis=1) > 0.005
+    assert moved.sum() > 20
+    still, smiling = (run.fit.avatar.mesh(p) for p in (neutral, smile))
+    away = [
+        np.median(closest_points(mesh.vertices, mesh.faces, after[moved])[0])
+        for mesh in (still, smiling)
+    ]
+    assert away[1] < 0.5 * away[0]
 
 
 def test_quiet_fit_prints_nothing(run, capsys):

@@ -85,7 +85,7 @@ class FixedHash(AbstractFixedPoints):
     def carried(self, condition: Any) -> Float[Array, "N 3"]:
         if self.moves is None:
             return self.points
-        moved = jnp.einsum("nek,e->nk", self.moves, condition.expression, precision=_EXACT)
+        moved = jnp.einsum("nek,e->nk", self.moves, condition.moves, precision=_EXACT)
         return self.points + moved
 
 

@@ -98,13 +98,15 @@ class LocalCondition(NamedTuple):
 
     - `joints`: features of each joint's rotation, heard around `centres` (metres) and fading with
       the squared distance by `fade`.
-    - `expression`: coefficients; none of them: silence.
+    - `expression`: coefficients as they are heard; none of them: silence.
+    - `moves`: coefficients as they move places; none of them: no move.
     """
 
     joints: Float[Array, "J K"]
     centres: Float[Array, "J 3"]
     fade: Float[Array, " J"]
     expression: Float[Array, " E"]
+    moves: Float[Array, " E"]
 
 
 class HashGeometry(AbstractGeometryField):
@@ -122,7 +124,8 @@ class HashGeometry(AbstractGeometryField):
 
     Entries of rotations and coefficients of expression beyond what `within` was told are heard as
     the nearest that are not: what noise teaches about a joint that hardly moved would be
-    multiplied by the angle that it turns by later.
+    multiplied by the angle that it turns by later. The body model's own expression is not learned,
+    and moves places by all that it is given.
     """
 
     encoding: HashEncoding
@@ -189,8 +192,9 @@ class HashGeometry(AbstractGeometryField):
         """A row for each joint, so that a point's condition is its nearness times these rows."""
         pose = _clipped(_turned(params.pose), self.pose_range)
         rows = jnp.einsum("jf,jfk->jk", pose, self.pose_weights)
-        expression = _clipped(self._known(params.expression), self.expression_range)
-        return LocalCondition(rows, *self._around_joints(rows.dtype), expression)
+        given = self._known(params.expression)
+        heard = _clipped(given, self.expression_range)
+        return LocalCondition(rows, *self._around_joints(rows.dtype), heard, given)
 
     def within(self, params: BodyParams) -> Self:
         shown = (
@@ -222,10 +226,10 @@ class HashGeometry(AbstractGeometryField):
 
     def _moved(self, x: Float[Array, "3"], condition: LocalCondition) -> Float[Array, "3"]:
         """How far the expression moves a place, metres."""
-        if self.moves is None or not len(condition.expression):
+        if self.moves is None or not len(condition.moves):
             return jnp.zeros_like(x)
         moves = jax.lax.stop_gradient(self.moves)
-        return moves.read(moves.under(condition.expression.astype(moves.table.dtype)), x)
+        return moves.read(moves.under(condition.moves.astype(moves.table.dtype)), x)
 
     def at(self, points: Float[Array, "N 3"]) -> FixedHash:
         features = jax.vmap(self._features)(points)
@@ -247,16 +251,16 @@ class HashGeometry(AbstractGeometryField):
     def audible(self, condition: LocalCondition) -> LocalCondition:
         # Rows are zero for joints at rest, and coefficients for a neutral face.
         heard = np.flatnonzero(np.asarray(condition.joints).any(axis=1))
-        speaks = np.asarray(condition.expression).any()
         return LocalCondition(
             condition.joints[heard],
             condition.centres[heard],
             condition.fade[heard],
-            condition.expression if speaks else condition.expression[:0],
+            _if_any(condition.expression),
+            _if_any(condition.moves),
         )
 
     def __call__(self, x_c: Float[Array, "3"], condition: LocalCondition) -> Float[Array, ""]:
-        joints, centres, fade, expression = condition
+        joints, centres, fade, expression, _ = condition
         x_c = self.carried_from(x_c, condition)
         h = [self._features(x_c), _nearness(x_c, centres, fade) @ joints]
         if self.expressive is not None and len(expression):
@@ -289,6 +293,10 @@ class HashGeometry(AbstractGeometryField):
             inside = jnp.clip(depth / 0.02, 0, 1)
             mask = jnp.maximum(mask, inside * jnp.asarray(spacing >= finest * 0.999, x.dtype))
         return mask
+
+
+def _if_any(coefficients: Float[Array, " E"]) -> Float[Array, " _"]:
+    return coefficients if np.asarray(coefficients).any() else coefficients[:0]
 
 
 def _turned(pose: Float[Array, "J 3"]) -> Float[Array, "J 9"]:
