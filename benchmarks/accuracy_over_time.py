@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 from methods import METHODS, learn
-from resumable import Row, add_options, every, fill, medians, rows_of, score
+from resumable import Row, add_options, every, fill, medians, read_options, rows_of, score
 
 import xavatar_jax as xa
 from xavatar_jax.render import grid_picture, save_png
@@ -71,9 +71,7 @@ def main() -> None:
     add_options(parser, METHODS, minutes=MINUTES, seeds=1)
     parser.add_argument("--picture", help="draw the curves into this PNG")
     parser.add_argument("--table2", help="JSON of table2_grab.py: its runs are not made again")
-    args = parser.parse_args()
-    if args.quick:
-        args.eval_frames, args.minutes = 1, [1.0]
+    args = read_options(parser)
     names = args.only or (("quick",) if args.quick else NAMES)
     capture = xa.synthetic_capture(args.cache_dir)
     settings = {"quick": args.quick, "eval_frames": args.eval_frames, "data": capture.name}

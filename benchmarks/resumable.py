@@ -52,6 +52,15 @@ def add_options(
     parser.add_argument("--cache-dir")
 
 
+def read_options(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """What was asked for; `--quick` decides how small it is, the same for all such tables."""
+    args = parser.parse_args()
+    if args.quick:
+        args.seeds, args.eval_frames = 1, 1
+        args.minutes = 1.0 if isinstance(args.minutes, float | int) else [1.0]
+    return args
+
+
 def every(**values: Iterable[Any]) -> list[dict[str, Any]]:
     """A job for each combination; the last entry changes fastest."""
     return [dict(zip(values, row, strict=True)) for row in product(*values.values())]

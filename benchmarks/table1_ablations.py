@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax
-from resumable import Row, add_options, every, fill, medians, score
+from resumable import Row, add_options, every, fill, medians, read_options, score
 from search_problems import least_time
 
 import xavatar_jax as xa
@@ -149,9 +149,7 @@ def main() -> None:
     add_options(parser, NAMES, minutes=3)
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, metavar="NAME", help="of "
                         + ", ".join(SETTINGS))  # fmt: skip
-    args = parser.parse_args()
-    if args.quick:
-        args.eval_frames, args.seeds = 1, 1
+    args = read_options(parser)
     names = args.only or (("complete", "A3") if args.quick else NAMES)
     settings = args.settings or (("quick",) if args.quick else SETTINGS)
     capture = xa.synthetic_capture(args.cache_dir)

@@ -16,11 +16,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
 from typing import Any
 
 from methods import METHODS, learn
-from resumable import add_options, every, fill, score
+from resumable import add_options, every, fill, read_options, score
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import Posable
@@ -47,16 +46,14 @@ def measure_speed(model: Posable, frames: xa.Frames) -> float:
     return 1000 * (time.perf_counter() - clock) / (len(frames) - 1)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     add_options(parser, METHODS, minutes=3.0)
     parser.add_argument("--data", help="a subject's folder, as examples/fit_grab.py takes it")
     parser.add_argument("--body", help="the body model of --data")
-    args = parser.parse_args(argv)
-    seeds = 1 if args.quick else args.seeds
-    eval_frames = min(args.eval_frames, 2) if args.quick else args.eval_frames
+    args = read_options(parser)
     body = xa.load_body(args.body) if args.body else xa.synthetic_body(args.cache_dir)
     if args.data:
         capture = xa.load_data(args.data, body=body)
@@ -71,17 +68,17 @@ def main(argv: Sequence[str] | None = None) -> None:
         return {
             **spent,
             "mesh_ms": measure_speed(model, shown),
-            **score(model, capture.test, eval_frames),
+            **score(model, capture.test, args.eval_frames),
         }
 
     fill(
-        every(name=args.only or NAMES, seed=range(seeds)),
+        every(name=args.only or NAMES, seed=range(args.seeds)),
         run,
         question="held-out accuracy of ours and the baselines at equal time",
         settings={
             "quick": args.quick,
             "minutes": args.minutes,
-            "eval_frames": eval_frames,
+            "eval_frames": args.eval_frames,
             "data": capture.name,
         },
         file=args.json,

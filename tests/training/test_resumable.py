@@ -116,6 +116,15 @@ def test_shared_options(resumable):
         parser.parse_args(["--only", "z"])
 
 
+@pytest.mark.parametrize(("minutes", "small"), [(3.0, 1.0), ((1.0, 30.0), [1.0])])
+def test_quick_is_the_same_size_in_every_table(resumable, monkeypatch, minutes, small):
+    parser = argparse.ArgumentParser()
+    resumable.add_options(parser, ("x", "y"), minutes=minutes)
+    monkeypatch.setattr(sys, "argv", ["table.py", "--quick"])
+    asked = resumable.read_options(parser)
+    assert (asked.seeds, asked.eval_frames, asked.minutes) == (1, 1, small)
+
+
 def test_a_body_judged_by_itself_is_near(resumable):
     body = xa.synthetic_body()
     params = xa.BodyParams.create(body, pose=np.zeros((1, body.num_joints, 3)))
