@@ -58,9 +58,10 @@ def picture(rows: Sequence[Row], minutes: Sequence[float]) -> UInt8[np.ndarray, 
     for region, title in (("all", "Chamfer, whole body, mm"), ("hands", "Chamfer, hands, mm")):
         key = f"cd_{region}_mm"
         lines: dict[str, list[tuple[float, float]]] = {}
-        for row in sorted(found, key=lambda row: row["minutes"]):
+        for row in found:
             if row.get(key):
                 lines.setdefault(row["name"], []).append((row["minutes"], row[key]))
+        lines = {name: sorted(line) for name, line in lines.items()}
         ticks = [m for m in minutes if any(m == x for line in lines.values() for x, _ in line)]
         charts.append(line_chart(lines, title=title, x_label="minutes", x_ticks=ticks))
     return grid_picture([charts])

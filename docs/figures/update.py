@@ -447,7 +447,9 @@ def medians_view(
         from resumable import medians
 
         rows = [[*shown, *(label for _, label, _ in columns)]]
-        for row in sorted(medians(record["rows"], by), key=lambda row: row.get("minutes", 0)):
+        found = medians(record["rows"], by)
+        first = list(dict.fromkeys(row[by[0]] for row in found))
+        for row in sorted(found, key=lambda row: (first.index(row[by[0]]), row.get("minutes", 0))):
             rows.append([*(f"{row[name]}" for name in shown), *_cells(row, columns)])
         header = record["header"]
         budget = f", {header['minutes']:g} minutes a run" if "minutes" in header else ""

@@ -19,7 +19,7 @@ def line_chart(
     log_x: bool = True,
     size: tuple[int, int] = (560, 420),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Named lines of (x, y), y on a logarithmic axis; the names stand beside the lines.
+    """Named lines of (x, y), y on a logarithmic axis; the names stand below.
 
     - `x_ticks`: where the x axis has its numbers, if not where they are round.
     - `size`: width and height, pixels.
@@ -27,6 +27,7 @@ def line_chart(
     # Not pyplot: it looks for a display, and keeps what it has drawn.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     figure = Figure(
         figsize=(size[0] / _PER_INCH, size[1] / _PER_INCH), dpi=_PER_INCH, layout="constrained"
@@ -37,6 +38,10 @@ def line_chart(
         few = len(points) <= 12
         axes.plot(*zip(*points, strict=True), label=name, marker="o" if few else None, ms=4)
     axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
     if log_x:
         axes.set_xscale("log")
     if x_ticks is not None:
