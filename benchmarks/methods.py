@@ -33,7 +33,7 @@ from xavatar_jax.body import BodyModel
 from xavatar_jax.frames import Frames
 from xavatar_jax.training import FitConfig, initial_fields
 
-STEPS = 100_000  # more than any budget here holds: minutes decide
+STEPS = 100_000  # more than any budget here holds: minutes decide, of the frames too
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Method:
         return found.avatar if self.learn is xa.fit else found
 
     def config(self, minutes: float, seed: int, small: bool) -> Any:
-        """The preset, ended by time alone; `small`, by a few steps."""
+        """The preset, with what time alone allows; `small`, with a few frames and steps."""
         config = self.preset()
         if isinstance(config, ScanimateConfig):
             stages = {name: getattr(config, name) for name in ("skin", "cycle", "shape")}
@@ -73,7 +73,7 @@ class Method:
                 config,
                 seed=seed,
                 minutes=None if small else minutes,
-                train_frames=3 if small else config.train_frames,
+                train_frames=3 if small else 0,
                 start=_configured(config.start, minutes, seed, small),
                 **{
                     name: replace(stage, steps=min(stage.steps, 60) if small else STEPS)
@@ -87,7 +87,7 @@ class Method:
 def _configured(config: FitConfig, minutes: float, seed: int, small: bool) -> FitConfig:
     if small:
         return replace(config, seed=seed, steps=6, train_frames=3, prefit_steps=60)
-    return replace(config, seed=seed, steps=STEPS, minutes=minutes)
+    return replace(config, seed=seed, steps=STEPS, minutes=minutes, train_frames=0)
 
 
 def _template_weights() -> FitConfig:

@@ -16,7 +16,7 @@ from xavatar_jax.files import load_arrays
 from xavatar_jax.training import TrainingNotice, budget, choose_frames, loop
 from xavatar_jax.training.budget import Pace, frames_in_budget
 from xavatar_jax.training.config import config_from_dict, config_to_dict
-from xavatar_jax.training.step import rate_factor
+from xavatar_jax.training.step import Fall, rate_factor
 
 
 class Clock:
@@ -76,24 +76,36 @@ def test_slow_steps_are_timed_less_and_whole_cycles_long(monkeypatch):
     assert pace.steps_left(0.0) == 1  # late already: one more, and an end
 
 
+def factor(config, step, fall):
+    return float(rate_factor(config, jnp.asarray(step), fall))
+
+
 def test_a_falling_rate_ends_at_a_hundredth_of_any_total():
     config = xa.quick()
     for total in (10, 1500):
-        left = [float(rate_factor(config, jnp.asarray(k), jnp.asarray(total))) for k in (0, total)]
+        left = [factor(config, k, Fall.create(total)) for k in (0, total)]
         np.testing.assert_allclose(left, [1.0, 0.01], rtol=1e-5)
-    middle = float(rate_factor(config, jnp.asarray(50), jnp.asarray(100)))
+    middle = factor(config, 50, Fall.create(100))
     np.testing.assert_allclose(middle, (1 + 0.01) / 2, rtol=1e-5)
     config = replace(config, optimiser=replace(config.optimiser, schedule="constant"))
-    assert float(rate_factor(config, jnp.asarray(9), jnp.asarray(10))) == 1.0
+    assert factor(config, 9, Fall.create(10)) == 1.0
+
+
+def test_an_end_that_comes_nearer_is_fallen_to_from_where_the_rate_is():
+    config = xa.quick()
+    whole, near = Fall.create(1000), Fall.create(700, since=600, share=0.6)
+    for step, same in ((600, 600), (650, 800), (700, 1000)):
+        np.testing.assert_allclose(
+            factor(config, step, near), factor(config, same, whole), rtol=1e-5
+        )
 
 
 def test_rates_rise_in_equal_parts_and_multiply_what_falls():
     config = xa.quick()
     rising = replace(config, optimiser=replace(config.optimiser, warmup=4))
     for k, part in enumerate((0.25, 0.5, 0.75, 1.0, 1.0)):
-        step, total = jnp.asarray(k), jnp.asarray(100)
-        expected = part * rate_factor(config, step, total)
-        np.testing.assert_allclose(rate_factor(rising, step, total), expected, rtol=1e-6)
+        expected = part * factor(config, k, Fall.create(100))
+        np.testing.assert_allclose(factor(rising, k, Fall.create(100)), expected, rtol=1e-6)
 
 
 def test_a_plan_is_kept_by_a_run_that_goes_on(case, no_prefit, tmp_path, monkeypatch):
@@ -115,7 +127,7 @@ def test_a_plan_is_kept_by_a_run_that_goes_on(case, no_prefit, tmp_path, monkeyp
     assert first.history.planned == plans[0]["steps"] == plans[0]["step"] + 20
     assert first.history.steps_done == first.history.planned
     assert first.history.stopped == "minutes"
-    assert int(load_arrays(path)[0]["state:total"]) == first.history.planned
+    assert int(load_arrays(path)[0]["state:fall.end"]) == first.history.planned
     again = call(resume=True)
     assert again.history.steps_done == first.history.planned
     for a, b in zip(

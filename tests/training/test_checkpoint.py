@@ -96,6 +96,24 @@ def test_a_run_with_a_guide_goes_on_with_the_one_it_had(job, tmp_path):
     assert resumed.history.validation == done.history.validation
 
 
+def test_a_run_that_lands_on_a_plateau_goes_on_landing(job, tmp_path):
+    """Stopped on the way down, which is from step 8 to step 10."""
+    call, _, config = job
+    validation = replace(config.validation, gain=1.0, patience=2)
+    config = replace(config, report_every=1, validation=validation)
+    done = call(config=config)
+    assert (done.history.landing, done.history.steps_done) == (8, 10)
+    file = tmp_path / "run.npz"
+    with pytest.raises(Interrupted, match="step 9 of 10"):
+        call(config=config, checkpoint=file, callback=interrupt_at(8))
+    resumed = call(config=config, checkpoint=file, resume=True)
+    assert same(done.avatar.fields, resumed.avatar.fields)
+    assert resumed.history.stopped == done.history.stopped == "plateau"
+    # More steps are another plan: with them there is no plateau yet.
+    more = call(config=replace(config, steps=40), checkpoint=file, resume=True)
+    assert more.history.steps_done > 20
+
+
 def test_a_stopped_run_goes_on_bit_for_bit(job, whole, tmp_path, monkeypatch):
     call, _, _ = job
     whole, folder, _ = whole

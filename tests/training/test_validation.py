@@ -144,11 +144,17 @@ def test_validation_is_the_loss_of_the_fields_at_their_roots(case, judged):
     assert float(ask(fields, pool, None)) == pytest.approx(expected, rel=0.15)
 
 
-def test_a_plateau_ends_training(case):
-    """With no loss small enough to count as a gain: at the first look after half of the steps."""
+@pytest.mark.parametrize(("schedule", "landing", "steps"), [("constant", 0, 6), ("cosine", 8, 10)])
+def test_a_plateau_ends_training(case, schedule, landing, steps):
+    """With no loss small enough to count as a gain after the first, at step 4.
+
+    A rate that falls: two steps after half of the twelve, and two more to be at its end.
+    """
     body, _, config, fields, pool = case
     validation = replace(config.validation, every=4, points=128, gain=1.0, patience=2)
-    config = replace(config, validation=validation)
+    optimiser = replace(config.optimiser, schedule=schedule)
+    config = replace(config, validation=validation, optimiser=optimiser)
     done = train_pool(body, fields, pool, np.zeros(10), config, held=1, verbose=False)
-    assert done.history.stopped == "plateau"
-    assert done.history.steps_done == 8
+    history = done.history
+    assert (history.stopped, history.steps_done) == ("plateau", steps)
+    assert history.landing == landing

@@ -24,7 +24,7 @@ from .pool import FramePool
 from .step import TrainState
 from .validation import Best
 
-_FORMAT = 2
+_FORMAT = 3
 # What may change from one part of a run to the next: how long it is, and how large its steps are.
 _FREE = (
     *("steps", "minutes", "report_every", "checkpoint_every", "validation.patience"),
@@ -99,9 +99,10 @@ class Checkpoint:
         return self.header["step"]
 
     @property
-    def minutes(self) -> float | None:
-        """The budget of the run's last part."""
-        return self.header["run"]["config"]["minutes"]
+    def budget(self) -> tuple[int, float | None]:
+        """Steps and minutes of the run's last part."""
+        config = self.header["run"]["config"]
+        return config["steps"], config["minutes"]
 
     @property
     def latest(self) -> dict[str, float]:

@@ -116,9 +116,9 @@ class ValidationConfig:
       none. 0: no validation, and the last fields are kept.
     - `frames`: how many of these are asked, spread over the sequences; `points`: of each.
     - `every`: steps between two validations.
-    - `patience`: steps without a gain after which training ends (0: never); with a cosine
-      schedule they count from half of the steps. `gain`: what counts as one, as a share of the
-      loss.
+    - `patience`: steps without a gain after which training ends (0: never). With a cosine
+      schedule they count from half of the steps, and the rates then fall to their end within as
+      many steps more. `gain`: what counts as one, as a share of the loss.
     """
 
     share: float = 0.1

@@ -18,7 +18,8 @@ class History:
     - `steps_done`; `best_step`: the step whose fields are kept; `stopped`: "steps", "minutes",
       "plateau", "interrupt" or "not finite".
     - `frames`: how many were learned from; `planned`: steps that the minutes were found to hold,
-      where the schedule falls (0: not planned).
+      where the schedule falls (0: not planned); `landing`: the step at which a plateau brought
+      the end nearer (0: none did).
     - `found`: share of points with a root, where roots are stored.
     - `notices`: what was said of the frames or the checkpoint.
     """
@@ -33,6 +34,7 @@ class History:
     stopped: str = ""
     frames: int = 0
     planned: int = 0
+    landing: int = 0
     found: float = float("nan")
     notices: list[str] = field(default_factory=list)
 

@@ -31,7 +31,7 @@ from .objective import ExtraTerms, make_anchors
 from .pool import FramePool, grids_for_search, polish_roots, tabulate_on
 from .progress import progress
 from .redraw import Redraw, put_rows
-from .step import make_steps, with_learned
+from .step import Fall, make_steps, with_learned
 from .validation import Best, make_validation
 
 Callback = Callable[[int, AvatarFields, dict[str, float]], None]
@@ -102,12 +102,12 @@ class Run:
             self.latest.update(saved.latest)
             state, self.at = saved.state(state), saved.step
             # More steps, or other minutes, are another plan.
-            if self.config.minutes is None or self.config.minutes != saved.minutes:
-                history.planned = 0
+            if (config.steps, config.minutes) != saved.budget:
+                history.planned = history.landing = 0
+                state = eqx.tree_at(lambda s: s.fall, state, Fall.create(config.steps))
             self.best = replace(self.best, learned=devices.replicate(self.best.learned))
-        state = eqx.tree_at(lambda s: s.total, state, jnp.asarray(self.total, jnp.int32))
         self.pace = None
-        if deadline is not None and not history.planned and config.optimiser.schedule == "cosine":
+        if deadline is not None and not history.planned and self._falls:
             self.pace = Pace(config.skinning_every if "skinning" in self.steps else 1, deadline)
         self.state, self.pool = devices.replicate(state), devices.replicate(pool)
         self.guide = self._tabulated(state.guide) if has_guide(config) else None
@@ -127,6 +127,10 @@ class Run:
     def guide_moves(self) -> bool:
         """Whether there is a guide, of a field that changes."""
         return self.guide is not None and self.config.skinning.learned
+
+    @property
+    def _falls(self) -> bool:
+        return self.config.optimiser.schedule == "cosine"
 
     @property
     def total(self) -> int:
@@ -196,6 +200,7 @@ class Run:
             self._renew_guide()
         if validated:
             self._validate()
+        self._land(bar)
         reason = self._reason(flag)
         kept = self.keeper is not None and (bool(reason) or k % config.checkpoint_every == 0)
         if reported or kept or reason:
@@ -211,8 +216,10 @@ class Run:
     def _reason(self, flag: StopFlag) -> str:
         """Why to stop now, or nothing."""
         if self.at >= self.total:
+            if self.history.landing:
+                return "plateau"
             return "steps" if self.total >= self.config.steps else "minutes"
-        if self.best.plateau(self.at, self.config, self.total):
+        if not self._falls and self.best.plateau(self.at, self.config):
             return "plateau"
         # Hosts have clocks and signals of their own: they ask each other, and not at every step.
         if jax.process_count() > 1 and self.at % self.config.report_every:
@@ -251,13 +258,28 @@ class Run:
         self._settle()
         extra = self.validation_s / self.config.validation.every
         extra += self.guide_s / max(self.config.search.guide_every, 1)
-        most = self.at + self.devices.least(pace.steps_left(extra))
-        self.history.planned = min(most, self.config.steps)
-        total = self.devices.replicate(jnp.asarray(self.total, jnp.int32))
-        self.state = eqx.tree_at(lambda s: s.total, self.state, total)
+        end = min(self.at + self.devices.least(pace.steps_left(extra)), self.config.steps)
         self.pace = None
+        self._end_at(end, Fall.create(end), "plan", bar)
+
+    def _land(self, bar: Any) -> None:
+        """On a plateau, let rates that fall do so within the patience, and end there.
+
+        What they fall through is often worth more than all steps at the rate before it.
+        """
+        end = self.at + self.config.validation.patience
+        if not self._falls or self.history.landing or self.pace is not None or end >= self.total:
+            return
+        if self.best.plateau(self.at, self.config, self.total):
+            self.history.landing = self.at
+            fall = Fall.create(end, since=self.at, share=self.at / self.total)
+            self._end_at(end, fall, "plateau", bar)
+
+    def _end_at(self, step: int, fall: Fall, event: str, bar: Any) -> None:
+        self.history.planned = step
+        self.state = eqx.tree_at(lambda s: s.fall, self.state, self.devices.replicate(fall))
         bar.total = self.total
-        self._write({"event": "plan", "step": self.at, "steps": self.total})
+        self._write({"event": event, "step": self.at, "steps": self.total})
 
     def _ask(self) -> float:
         """The loss on the validation frames."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,17 +30,36 @@ from .objective import (
 from .pool import FramePool
 
 
+class Fall(NamedTuple):
+    """Of rates that fall: a share of the way was over at one step, and all of it is at another.
+
+    It may change while a run goes on: it is no constant of the compiled step.
+    """
+
+    since: Int[Array, ""]
+    share: Float[Array, ""]
+    end: Int[Array, ""]
+
+    @classmethod
+    def create(cls, end: int, *, since: int = 0, share: float = 0.0) -> Fall:
+        return cls(
+            jnp.asarray(since, jnp.int32),
+            jnp.asarray(share, jnp.float32),
+            jnp.asarray(end, jnp.int32),
+        )
+
+
 class TrainState(eqx.Module):
     """What a step changes: learned leaves, an optimiser state for each field, steps done.
 
-    `total`: the step at which a falling rate is at its end; `guide`: the learned leaves of the
+    `fall`: when a falling rate is at its end; `guide`: the learned leaves of the
     skinning field as the guide of the searches has it, if they have one.
     """
 
     learned: AvatarFields
     optimisers: dict[str, Any]
     step: Int[Array, ""]
-    total: Int[Array, ""]
+    fall: Fall
     guide: Any = None
 
 
@@ -57,15 +76,13 @@ def make_optimiser(config: FitConfig) -> optax.GradientTransformation:
     )
 
 
-def rate_factor(config: FitConfig, step: Int[Array, ""], total: Int[Array, ""]) -> Float[Array, ""]:
-    """The part of the learning rates at a step: rising first, then to a hundredth at the last.
-
-    `total` may be told while a run goes on: it is no constant of the compiled step.
-    """
+def rate_factor(config: FitConfig, step: Int[Array, ""], fall: Fall) -> Float[Array, ""]:
+    """The part of the learning rates at a step: rising first, then to a hundredth at the last."""
     risen = jnp.minimum((step + 1) / max(config.optimiser.warmup, 1), 1.0)
     if config.optimiser.schedule == "constant":
         return risen
-    return risen * cosine(step / jnp.maximum(total, 1).astype(jnp.float32))
+    over = (step - fall.since) / jnp.maximum(fall.end - fall.since, 1).astype(jnp.float32)
+    return risen * cosine(fall.share + (1 - fall.share) * over)
 
 
 def cosine(share: Float[Array, ""]) -> Float[Array, ""]:
@@ -176,9 +193,9 @@ def make_steps(
     for plan in _plans(pool, config, held):
         optimisers[plan.name] = make_optimiser(config).init(_own(learned, plan.name))
         steps[plan.name] = bind(plan)
-    at, total = jnp.zeros((), jnp.int32), jnp.asarray(config.steps, jnp.int32)
+    at, fall = jnp.zeros((), jnp.int32), Fall.create(config.steps)
     guide = jax.tree.map(jnp.copy, learned.skinning) if has_guide(config) else None
-    return TrainState(learned, optimisers, at, total, guide), steps
+    return TrainState(learned, optimisers, at, fall, guide), steps
 
 
 @dataclass(frozen=True)
@@ -265,10 +282,10 @@ def _step(
     own = _own(state.learned, name)
     (total, terms), gradient = jax.value_and_grad(loss, has_aux=True)(own)
     updates, optimiser_state = make_optimiser(config).update(gradient, state.optimisers[name], own)
-    updates = _at_rates(updates, name, config, rate_factor(config, state.step, state.total))
+    updates = _at_rates(updates, name, config, rate_factor(config, state.step, state.fall))
     learned = _with_own(state.learned, name, eqx.apply_updates(own, updates))
     optimisers = {**state.optimisers, name: optimiser_state}
-    after = TrainState(learned, optimisers, state.step + 1, state.total, state.guide)
+    after = TrainState(learned, optimisers, state.step + 1, state.fall, state.guide)
     size = optax.tree.norm(gradient)
     good = jnp.isfinite(total) & jnp.isfinite(size)
     after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)

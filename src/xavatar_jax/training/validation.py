@@ -105,8 +105,8 @@ class Best:
     def plateau(self, step: int, config: FitConfig, total: int | None = None) -> bool:
         """Whether there was no gain for so long that training, of `total` steps, can stop.
 
-        A loss that stands still under a high rate often falls again as the rate does: with a
-        falling rate, only the second half of the steps counts.
+        With a falling rate, only the second half of the steps counts: a loss that stands still
+        under a high rate often falls again as the rate does.
         """
         patience = config.validation.patience
         if not patience or not np.isfinite(self.mark):
