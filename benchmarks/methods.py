@@ -33,7 +33,7 @@ from xavatar_jax.body import BodyModel
 from xavatar_jax.frames import Frames
 from xavatar_jax.training import FitConfig, initial_fields
 
-STEPS = 100_000  # more than any budget here holds: minutes decide, of the frames too
+STEPS = 100_000  # more than any budget here holds: minutes decide
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -29,9 +30,12 @@ def test_round_trip_gives_the_same_mesh(run, saved):
 
 
 def test_round_trip_keeps_what_expressions_do(run, tmp_path):
-    avatar = run.fit.avatar
+    heard = jnp.stack([jnp.full(10, -1.0), jnp.full(10, 1.0)])
+    fields = eqx.tree_at(lambda f: f.geometry.expression_range, run.fit.avatar.fields, heard)
+    avatar = replace(run.fit.avatar, fields=fields)
     avatar.save(tmp_path / "avatar.npz")
     again = xa.load_avatar(tmp_path / "avatar.npz", body=run.body)
+    assert np.array_equal(again.fields.geometry.expression_range, heard)
     neutral = canonical_params(run.body)
     smile = replace(neutral, expression=jnp.asarray([1.0, *9 * [0.0]]))
     vertices = again.mesh(smile).vertices

@@ -52,8 +52,8 @@ class Fall(NamedTuple):
 class TrainState(eqx.Module):
     """What a step changes: learned leaves, an optimiser state for each field, steps done.
 
-    `fall`: when a falling rate is at its end; `guide`: the learned leaves of the
-    skinning field as the guide of the searches has it, if they have one.
+    `fall`: when a falling rate is at its end; `guide`: the learned leaves of the skinning field as
+    the guide of the searches has it, if they have one.
     """
 
     learned: AvatarFields
