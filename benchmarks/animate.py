@@ -22,11 +22,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from search_problems import peak_rise_mb
+from measuring import peak_rise_mb, write_result
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import Animation, GlbExport
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine
 
 OFFSETS = ("cached", "none", "exact")
 CELLS = {
@@ -120,7 +120,7 @@ def measure_motion(
     start = time.perf_counter()
     avatar.canonical_mesh()
     extracted = time.perf_counter()
-    jax.block_until_ready(avatar.posable)
+    jax.block_until_ready(avatar.neutral_surface)
     ready = time.perf_counter()
     rows = [
         measure_animation(
@@ -174,9 +174,7 @@ def main() -> None:
                 f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
             )
         )
-    if args.json:
-        write_json(args.json, {"header": header, "rows": rows})
-        print(f"written: {args.json}")
+    write_result(args.json, header, rows)
 
 
 if __name__ == "__main__":

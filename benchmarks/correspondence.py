@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from measuring import least_time, peak_rise_mb, print_rows
 from resumable import rows_of
 from search_problems import (
     FULL_PREFIT,
@@ -35,17 +36,14 @@ from search_problems import (
     carry,
     hard_problems,
     hits,
-    least_time,
     near_surface,
     paper_field,
-    peak_rise_mb,
-    print_rows,
     recall,
 )
-from self_contact import contact_points, contact_poses, inner_nodes, score
+from self_contact import contact_points, contact_poses, inner_nodes, root_shares
 
 import xavatar_jax as xa
-from xavatar_jax.body import BodyModel
+from xavatar_jax.body import HANDS, BodyModel
 from xavatar_jax.correspondence import (
     Group,
     StartSet,
@@ -423,7 +421,7 @@ def resolution_table(
                         cases, fields, "grid", size.repeats)  # fmt: skip
         guided = fast_row(compiled("guided", mlp, fields, table, own[0]),
                           own, fields, "guided", 1)  # fmt: skip
-        hands = np.isin(parts, (2, 3))
+        hands = np.isin(parts, HANDS)
         rows.append(
             {
                 "table": "resolution",
@@ -489,7 +487,7 @@ def contact_table(
                         roots = search_field(f, x, part, transforms, t, guide=guide, keep=keep)
                     return np.asarray(roots.x_c), np.asarray(roots.valid)
 
-                shares = score(made[of], search, getattr(made[of], row_of))
+                shares = root_shares(made[of], search, getattr(made[of], row_of))
                 label = {"case": name, "path": path, "field": of, "starts": starts}
                 rows.append({"table": "contact", **label, **shares})
                 print_rows(rows[-1:], tuple(rows[-1])[1:])

@@ -23,14 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from search_problems import (
-    FULL_PREFIT,
-    QUICK_PREFIT,
-    hard_problems,
-    least_time,
-    paper_field,
-    print_rows,
-)
+from measuring import least_time, print_rows, write_result
+from search_problems import FULL_PREFIT, QUICK_PREFIT, hard_problems, paper_field
 
 import xavatar_jax as xa
 from xavatar_jax.correspondence import (
@@ -47,7 +41,7 @@ from xavatar_jax.fields import (
     skin_with_jacobian,
 )
 from xavatar_jax.kinematics import determinant_3x3, inverse_3x3, skin_points, solve_3x3
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine
 
 VARIED = ("field", "transforms", "point")
 UNROLLED_STEPS = {"newton": 12, "broyden": 30}
@@ -434,9 +428,7 @@ def main() -> None:
     for name in ("accuracy", "float32", "time", "step"):
         part = [row for row in rows if row["table"] == name]
         print_rows(part, tuple(part[0])[1:])
-    if args.json:
-        write_json(args.json, {"header": header, "rows": rows})
-        print(f"written: {args.json}")
+    write_result(args.json, header, rows)
 
 
 if __name__ == "__main__":

@@ -84,16 +84,14 @@ def main() -> None:
     # The library is imported after the children have run: what a process holds when it starts
     # another one counts as that one's peak.
     rows = [in_a_child(count, args) for count in args.counts]
-    from search_problems import print_rows
+    from measuring import print_rows, write_result
 
-    from xavatar_jax.report import describe_machine, write_json
+    from xavatar_jax.report import describe_machine
 
     print_rows(rows, tuple(rows[0]))
-    if args.json:
-        header = {"question": "does the memory of fit grow with the number of frames"}
-        header |= {**describe_machine(), "steps": args.steps, "quick": args.quick}
-        write_json(args.json, {"header": header, "rows": rows})
-        print(f"written: {args.json}")
+    header = {"question": "does the memory of fit grow with the number of frames"}
+    header |= {**describe_machine(), "steps": args.steps, "quick": args.quick}
+    write_result(args.json, header, rows)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ import argparse
 from typing import Any
 
 import numpy as np
-from search_problems import print_rows
+from measuring import print_rows, write_result
 
 import xavatar_jax as xa
 from xavatar_jax.frames import spread
 from xavatar_jax.metrics import surface_metrics
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine
 
 METRICS = {"cd_mm": "Chamfer", "nc": "normal consistency", "iou": "volume", "iou_box": "boxes"}
 REGIONS = ("all", "hands", "face")
@@ -46,10 +46,8 @@ def main() -> None:
     frames = test[spread(test, args.frames)]
     rows = [floor_row(frames, samples) for samples in (10_000, 100_000)]
     print_rows(rows, tuple(rows[0]))
-    if args.json:
-        header = {"question": "metrics of the truth against itself", **describe_machine()}
-        write_json(args.json, {"header": {**header, "frames": args.frames}, "rows": rows})
-        print(f"written: {args.json}")
+    header = {"question": "metrics of the truth against itself", **describe_machine()}
+    write_result(args.json, {**header, "frames": args.frames}, rows)
 
 
 if __name__ == "__main__":

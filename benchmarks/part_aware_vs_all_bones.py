@@ -19,13 +19,13 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from measuring import least_time, write_result
 from search_problems import (
     FULL_PREFIT,
     QUICK_PREFIT,
     Problem,
     hits,
     known_points,
-    least_time,
     paper_config,
     recall,
 )
@@ -34,7 +34,7 @@ import xavatar_jax as xa
 from xavatar_jax.avatar import Avatar
 from xavatar_jax.body import canonical_vertices
 from xavatar_jax.correspondence import Roots, StartSet, search_field, start_table
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine
 from xavatar_jax.sampling import varied_frames
 from xavatar_jax.training import AvatarFields, FitConfig, subject_betas
 from xavatar_jax.training.loop import train_pool
@@ -184,9 +184,7 @@ def main() -> None:
         "equal_time_s": budget,
     }
     print_table(header, rows)
-    if args.json:
-        write_json(args.json, {"header": header, "rows": rows})
-        print(f"written: {args.json}")
+    write_result(args.json, header, rows)
 
 
 def print_table(header: dict[str, Any], rows: list[dict[str, Any]]) -> None:

@@ -18,24 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 from correspondence import tabulated
 from jaxtyping import Bool, Int
+from measuring import print_rows, write_result
 from scipy.spatial import cKDTree
-from search_problems import (
-    FULL_PREFIT,
-    NOISE_M,
-    QUICK_PREFIT,
-    carry,
-    hard_pose,
-    hits,
-    paper_field,
-    print_rows,
-)
+from search_problems import FULL_PREFIT, NOISE_M, QUICK_PREFIT, carry, hard_pose, hits, paper_field
 
 import xavatar_jax as xa
 from xavatar_jax.body import BODY, EYES_MOUTH, FACE, LEFT_HAND, RIGHT_HAND
 from xavatar_jax.correspondence import RowFinder, search_grid, start_table
 from xavatar_jax.correspondence.nearby import NEAR
 from xavatar_jax.fields import mean_canonical_vertices, pose_grid
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine
 
 BORDERS = {
     "wrists": ((BODY,), (LEFT_HAND, RIGHT_HAND)),
@@ -117,9 +109,7 @@ def main() -> None:
         "grid_mm": grid_mm,
         "frames": frames,
     }
-    if args.json:
-        write_json(args.json, {"header": header, "rows": rows})
-        print(f"written: {args.json}")
+    write_result(args.json, header, rows)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from statistics import median
 from typing import Any
 
 import jax
-from search_problems import print_rows
+from measuring import print_rows
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import Posable

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -152,44 +150,3 @@ def recall(hit: Bool[np.ndarray, " P"], parts: Int[np.ndarray, " P"]) -> dict[st
         f"recall_{name}": float(hit[slice(None) if own is None else np.isin(parts, own)].mean())
         for name, own in regions.items()
     }
-
-
-def least_time(run: Callable[[], Any], repeats: int) -> tuple[Any, float]:
-    """What `run` returns, and the least of its times in seconds; results are waited for."""
-    spent, result = [], None
-    for _ in range(repeats):
-        clock = time.perf_counter()
-        result = jax.block_until_ready(run())
-        spent.append(time.perf_counter() - clock)
-    return result, min(spent)
-
-
-def peak_rise_mb(run: Callable[[], Any]) -> float | None:
-    """By how much resident memory rises at most while something runs, MiB; None if not Linux."""
-    mark, status = Path("/proc/self/clear_refs"), Path("/proc/self/status")
-    try:
-        mark.write_text("5")  # the high-water mark starts again from here
-        before = _resident_kb(status, "VmRSS")
-        run()
-        return max(_resident_kb(status, "VmHWM") - before, 0) / 1024
-    except OSError:
-        return None
-
-
-def _resident_kb(status: Path, name: str) -> int:
-    line = next(v for v in status.read_text().splitlines() if v.startswith(name))
-    return int(line.split()[1])
-
-
-def print_rows(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
-    """A plain table of some columns, wide ones as they are."""
-    cells = [[_cell(row.get(name)) for name in columns] for row in rows]
-    widths = [max(len(c[k]) for c in [columns, *cells]) for k in range(len(columns))]
-    for line in (list(columns), *cells):
-        print("  ".join(f"{text:>{width}}" for text, width in zip(line, widths, strict=True)))
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
-    return value if isinstance(value, str) else f"{value:.4g}"

@@ -305,7 +305,7 @@ def _spread(points: np.ndarray) -> float:
     return float(np.linalg.norm(points[:, None] - points[None], axis=-1).max())
 
 
-def score(
+def root_shares(
     contact: Contact,
     search: Callable[[Array, Array, Array], tuple[np.ndarray, np.ndarray]],
     rows: Int[np.ndarray, " Q"],

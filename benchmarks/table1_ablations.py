@@ -24,8 +24,8 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax
+from measuring import least_time
 from resumable import Row, add_options, every, fill, medians, read_options, score
-from search_problems import least_time
 
 import xavatar_jax as xa
 from xavatar_jax.training import ABLATIONS, FitConfig, initial_fields

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from search_problems import print_rows
+from measuring import print_rows, write_result
 
 import xavatar_jax as xa
 from xavatar_jax.geometry import closest_points
@@ -30,7 +30,7 @@ from xavatar_jax.render import (
     turntable,
     weight_colors,
 )
-from xavatar_jax.report import describe_machine, write_json
+from xavatar_jax.report import describe_machine
 
 
 def clock(work: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
@@ -92,7 +92,7 @@ def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> Non
     """Four ways to look at one frame."""
     camera = frame_view(mesh.vertices, "three_quarter", aspect=0.62)
     distance, _, _ = closest_points(frame.vertices, frame.faces, mesh.vertices)
-    weights = weight_colors(np.asarray(avatar.posable.weights).T)
+    weights = weight_colors(np.asarray(avatar.neutral_surface.weights).T)
     ways = {
         "color": (mesh, "color"),
         "normal": (mesh, "normal"),
@@ -132,9 +132,7 @@ def main() -> None:
         **describe_machine(),
         "vertices": mesh.num_vertices,
     }
-    if options.json:
-        write_json(options.json, {"header": header, "rows": rows})
-        print(f"written: {options.json}")
+    write_result(options.json, header, rows)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def resumable():
 
         patch.setattr(resumable.jax, "clear_caches", lambda: None)
         yield resumable
-        for name in ("resumable", "search_problems"):
+        for name in ("resumable", "measuring"):
             sys.modules.pop(name, None)
 
 
