@@ -212,6 +212,22 @@ def test_entries_that_are_not_finite(tmp_path, smplx, key, value):
         load_body(path)
 
 
+def test_weights_are_shares_of_one(tmp_path, smplx):
+    """Rounded ones are divided by their sum, with a word; negative or empty rows are refused."""
+    whole = smplx["weights"]
+    rounded = np.where(whole < 0.02, 0, whole)
+    assert rounded.sum(1).min() < 0.99
+    with pytest.warns(UserWarning, match=r"a\.npz: weights of \d+ vertices do not sum to one"):
+        body = load_body(write_npz(tmp_path / "a.npz", {**smplx, "weights": rounded}))
+    np.testing.assert_allclose(body.weights, rounded / rounded.sum(1)[:, None], atol=1e-6)
+    for row in (0 * whole[7], np.where(np.arange(whole.shape[1]) == 1, 1.3, -0.3 / 54)):
+        bad = whole.copy()
+        bad[7] = row
+        path = write_npz(tmp_path / "b.npz", {**smplx, "weights": bad})
+        with pytest.raises(ValueError, match=r"weights of 1 vertices are negative.*vertex 7"):
+            load_body(path)
+
+
 def test_faces_labels_and_trees_out_of_range(tmp_path, smplx):
     faces = smplx["f"].copy()
     faces[3, 1] = 70

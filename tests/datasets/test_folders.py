@@ -6,9 +6,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from xavatar_jax.body import BodyParams, pose_body
+from xavatar_jax.body import BodyParams, load_body, pose_body, pose_groups
 from xavatar_jax.datasets import find_gender, load_data, load_folder, load_frames, load_prepared
 from xavatar_jax.datasets.capture import CaptureNotice
+from xavatar_jax.files.meshes import read_mesh
 
 BETAS = np.linspace(-0.8, 0.8, 10)
 SIZES = {
@@ -239,3 +240,79 @@ def test_meshes_in_millimetres_are_noticed(toy_body, tmp_path):
     mesh.export(tmp_path / "a.ply")
     with pytest.raises(ValueError, match=r"do not belong together.*units \(metres\)"):
         load_frames(tmp_path, toy_body)
+
+
+@pytest.mark.parametrize("scans", ["meshes_pkl", "meshes_ply"])
+def test_scans_of_x_humans_are_what_is_learned_from(toy_body, prepared, tmp_path, scans):
+    """They stand beside the registered body of each frame, and are not it."""
+    subject = shutil.copytree(prepared, tmp_path / "00016")
+    for folder in subject.glob("*/*/SMPLX"):
+        (folder.parent / scans).mkdir()
+        for params in folder.glob("*.pkl"):
+            name = params.stem.removesuffix("_smplx")
+            mesh = trimesh.load_mesh(params.with_suffix(".ply"), process=False).subdivide()
+            if scans == "meshes_ply":
+                mesh.export(folder.parent / scans / f"{name}.ply")
+            else:
+                held = {"vertices": np.asarray(mesh.vertices), "faces": np.asarray(mesh.faces)}
+                held |= {"uvs": np.zeros((len(mesh.faces), 6))}
+                (folder.parent / scans / f"{name}.pkl").write_bytes(pickle.dumps(held))
+                (folder.parent / scans / f"atlas-{name[5:]}.pkl").write_bytes(b"a picture")
+    capture = load_data(subject, toy_body)
+    assert (len(capture.train), len(capture.test)) == (3, 2)
+    for frame in (*capture.train, *capture.test):
+        assert len(frame.vertices) > 3 * toy_body.num_vertices
+        assert f"/{scans}/mesh-f" in frame.source
+    lost = next(subject.glob(f"train/*/{scans}/mesh-f*"))
+    lost.unlink()
+    with pytest.raises(FileNotFoundError, match=r"_smplx\.pkl: no \.ply mesh"):
+        load_data(subject, toy_body)
+
+
+def test_a_pickle_that_is_no_mesh_says_what_it_holds(tmp_path):
+    file = tmp_path / "mesh-f00001.pkl"
+    file.write_bytes(pickle.dumps({"vertices": np.zeros((3, 3)), "uvs": np.zeros(2)}))
+    with pytest.raises(ValueError, match=r"mesh-f00001\.pkl: no faces; it holds vertices, uvs"):
+        read_mesh(file)
+
+
+def test_frames_in_the_folder_itself_are_a_sequence_of_its_name(toy_body, tmp_path):
+    for i in range(4):
+        write_frame(tmp_path / "mine", f"f{i}", toy_body, i)
+    assert list(load_frames(tmp_path / "mine", toy_body).sequences) == ["mine"]
+
+
+def test_more_coefficients_than_the_body_has_are_said(toy_body, tmp_path):
+    few = load_body(toy_body.source.path, num_betas=4, num_expression=2)
+    write_frame(tmp_path / "f", "a", toy_body, 1)
+    with pytest.warns(CaptureNotice) as said:
+        frames = load_frames(tmp_path / "f", few)
+    messages = " ".join(str(w.message) for w in said)
+    assert "10 betas given, the body has 4" in messages
+    assert "10 expression given, the body has 2" in messages
+    assert frames.params.expression.shape == (1, 2)
+
+
+def test_other_names_of_parameters_are_those_of_motions(toy_body, tmp_path):
+    values = frame_params(5)
+    renamed = {"root_orient": values.pop("global_orient"), "pose_body": values.pop("body_pose"),
+               "trans": values.pop("transl"), "expressions": values.pop("expression")}  # fmt: skip
+    np.savez(tmp_path / "a.npz", shape=BETAS, **values, **renamed)
+    posed_mesh(toy_body, frame_params(5)).export(tmp_path / "a.ply")
+    frame = load_frames(tmp_path, toy_body)[0]
+    posed = pose_body(toy_body, frame.params).vertices
+    np.testing.assert_allclose(frame.vertices, posed, atol=1e-5)
+
+
+def test_a_hand_alone_needs_no_body_pose(family, tmp_path):
+    body = family["mano"]
+    rng = np.random.default_rng(0)
+    turns = {"global_orient": rng.normal(size=3), "transl": rng.normal(size=3)}
+    name = next(n for n in ("right_hand_pose", "left_hand_pose") if pose_groups(body.tree)[n])
+    turns |= {name: 0.3 * rng.normal(size=45)}
+    posed = pose_body(body, BodyParams.create(body, **turns)).vertices
+    trimesh.Trimesh(np.asarray(posed), body.faces, process=False).export(tmp_path / "a.ply")
+    np.savez(tmp_path / "a.npz", betas=np.zeros(body.num_betas), **turns)
+    frame = load_frames(tmp_path, body)[0]
+    posed = pose_body(body, frame.params).vertices
+    np.testing.assert_allclose(frame.vertices, posed, atol=1e-5)

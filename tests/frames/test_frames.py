@@ -157,6 +157,21 @@ def test_read_mesh_keeps_every_vertex_of_an_obj_with_seams(tmp_path):
     np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 2, 3]])
 
 
+def test_read_mesh_keeps_every_vertex_of_a_ply_with_texture_coordinates(tmp_path):
+    """Of its corners, and different at the two of a vertex, as a seam has them."""
+    path = tmp_path / "seams.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
+        "property list uchar float texcoord\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n9 9 9\n"
+        "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 0.5 0.5 0.2 0.2 0 1\n"
+    )
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices[4], [9, 9, 9])
+    np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 2, 3]])
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

@@ -19,7 +19,7 @@ from xavatar_jax.motion import (
     save_bvh,
     save_motion,
 )
-from xavatar_jax.motion.bvh_joints import NEEDED
+from xavatar_jax.motion.bvh_joints import NEEDED, match_joints
 
 ROOT = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
 TURNS = ROOT[3:]
@@ -325,3 +325,35 @@ def test_every_map_leads_to_what_is_needed(name):
         side = {"l": "left", "r": "right"}.get(theirs[0].lower())
         if ours.startswith(("left", "right")):
             assert ours.startswith(str(side)), (theirs, ours)
+
+
+_LIMB_NAMES = [
+    f"{side}{name}"
+    for side in ("Left", "Right")
+    for name in ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand")
+]
+
+
+@pytest.mark.parametrize(
+    ("title", "names", "first"),
+    [
+        # As CMU's captures have them, with a finger named as Mixamo names it.
+        (
+            "cmu",
+            ["Hips", "LHipJoint", "RHipJoint", "LowerBack", "Spine", "Spine1", "Neck", "Neck1",
+             "Head", "LeftFingerBase", "LeftHandIndex1", "LThumb", "RightFingerBase",
+             "RightHandIndex1", "RThumb", *_LIMB_NAMES],
+            "LowerBack",
+        ),
+        (
+            "mixamo",
+            ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head", *_LIMB_NAMES,
+             *(f"LeftHand{f}{k}" for f in ("Index", "Thumb") for k in (1, 2, 3))],
+            "Spine",
+        ),
+    ],
+)  # fmt: skip
+def test_the_map_is_chosen_by_the_joints_of_the_body(title, names, first):
+    found, joints = match_joints(tuple(names), None, "file.bvh")
+    assert found == title
+    assert names[joints["spine1"]] == first

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ _DOWNLOADS = {
 }
 _SHAPE_SPACE = 300  # SMPL-X: shape in columns 0 to 299, expression from 300
 _OLD_SHAPE_SPACE = 10  # first SMPL-X release: ten of each
+_ROUNDED = 1e-3  # of a row of weights: what float16 leaves
 
 
 def load_body(
@@ -116,7 +118,7 @@ def _build(
     faces = _array(file, data, "f", (None, 3)).astype(np.int32)
     if len(faces) and (faces.min() < 0 or faces.max() >= vertices):
         raise ValueError(f"{file}: f refers to vertex {faces.max()}, but there are {vertices}")
-    weights = _array(file, data, "weights", (vertices, joints))
+    weights = _weights(file, data, (vertices, joints))
     regressor = _dense(data.get("J_regressor"))
     regressor = _array(file, {"J_regressor": regressor}, "J_regressor", (joints, vertices))
     posedirs = _array(file, data, "posedirs", (vertices, 3, 9 * (joints - 1)))
@@ -185,6 +187,27 @@ def _array(file: Path, data: dict[str, Any], key: str, shape: tuple[int | None, 
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{file}: {key} has entries that are not finite")
     return array
+
+
+def _weights(file: Path, data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
+    """Skinning weights; rows that do not sum to one, as rounded ones may not, are made to."""
+    weights = _array(file, data, "weights", shape)
+    total = weights.sum(1, dtype=np.float64)
+    bad = (total <= 0) | (weights.min(1, initial=0) < -_ROUNDED)
+    if bad.any():
+        raise ValueError(
+            f"{file}: weights of {bad.sum()} vertices are negative or all zero, the first those of "
+            f"vertex {int(np.argmax(bad))}; each row is shares of one"
+        )
+    off = np.abs(total - 1) > _ROUNDED
+    if not off.any():
+        return weights
+    warnings.warn(
+        f"{file}: weights of {off.sum()} vertices do not sum to one ({total.min():.3f} to "
+        f"{total.max():.3f}); they have been divided by their sum",
+        stacklevel=2,
+    )
+    return weights / total[:, None]
 
 
 def _dense(value: Any) -> Any:

@@ -201,6 +201,8 @@ def bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "J 4 4"
 
     $B_i = A_i(\\theta) A_i(\\theta_{cano})^{-1}$ with the canonical body of the same shape and no
     expression (X-Avatar, section 3). Use `jax.vmap` over a batch of parameters.
+
+    **Raises:** `ValueError` for batched parameters, or those of another tree.
     """
     _check_single(body, params)
     posed = relative_transforms(

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..body import BodyModel
 from ..frames import Frames
+from ..motion.values import read_gender
 from .capture import Capture, notify, resolve_gender, split_names
 from .mesh_frames import check_first_frame, mesh_frames, read_params
 
@@ -89,9 +90,7 @@ def load_folder(
     frames, shape, notices = _load(found, body, betas, flat_hand_mean, verbose)
     held = _held_out(found, folder, test, split_seed)
     gender_file = folder / "gender.txt"
-    genders = {}
-    if gender_file.is_file():
-        genders[str(gender_file)] = gender_file.read_text(encoding="utf-8").strip().lower()
+    genders = {str(gender_file): read_gender(gender_file)} if gender_file.is_file() else {}
     subject_gender, more = resolve_gender(genders, body, gender, folder)
     return Capture(
         name=folder.name,
@@ -126,10 +125,13 @@ def find_frames(folder: Path) -> list[tuple[str, Path, Path]]:
             raise FileNotFoundError(
                 f"{params[name]}: no mesh beside it ({name.name}.ply or .obj). {_wanted()}"
             )
-    return [
-        (name.parent.relative_to(folder).as_posix(), meshes[name], params[name])
-        for name in sorted(meshes)
-    ]
+    return [(_sequence(name, folder), meshes[name], params[name]) for name in sorted(meshes)]
+
+
+def _sequence(name: Path, folder: Path) -> str:
+    """Frames in the folder itself are a sequence of its name."""
+    inner = name.parent.relative_to(folder).as_posix()
+    return folder.resolve().name if inner == "." else inner
 
 
 def _by_name(folder: Path, suffixes: tuple[str, ...]) -> dict[Path, Path]:

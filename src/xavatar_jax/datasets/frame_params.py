@@ -9,21 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..body import BodyModel, BodyParams, hands_to_absolute, pose_groups
-from ..files import load_npz, load_pickle
+from ..motion.params import ALIASES, read_named
 from ..motion.values import rotation_vectors
 
-_ALIASES = {
-    "global_orient": ("global_orient", "root_orient"),
-    "body_pose": ("body_pose", "pose_body"),
-    "left_hand_pose": ("left_hand_pose",),
-    "right_hand_pose": ("right_hand_pose",),
-    "jaw_pose": ("jaw_pose", "pose_jaw"),
-    "leye_pose": ("leye_pose",),
-    "reye_pose": ("reye_pose",),
-    "transl": ("transl", "trans"),
-    "betas": ("betas",),
-    "expression": ("expression",),
-}
 _REQUIRED = ("global_orient", "body_pose", "transl")
 _HANDS = {"left_hand_pose": "left", "right_hand_pose": "right"}
 
@@ -38,23 +26,20 @@ def read_frame_params(path: Path, body: BodyModel) -> dict[str, np.ndarray]:
         ValueError: a parameter is missing, has the wrong size, or is not finite; the message
             names the file, what was looked for, and what was found.
     """
-    data = load_npz(path) if path.suffix.lower() == ".npz" else load_pickle(path)
-    if not isinstance(data, dict):
-        raise ValueError(f"{path}: holds a {type(data).__name__}, not parameters by name.")
-    data = _split_full_pose(data, body, path)
+    data = _split_full_pose(read_named(path), body, path)
     groups = pose_groups(body.tree)
     params = {}
-    for name, aliases in _ALIASES.items():
+    for name, aliases in ALIASES.items():
         key = next((alias for alias in aliases if alias in data), None)
         joints = len(groups.get(name, ()))
+        if name in groups and joints == 0:
+            continue  # a body without this joint
         if key is None:
             if name in _REQUIRED:
                 raise ValueError(
                     f"{path}: no {' or '.join(aliases)}; found {', '.join(sorted(data))}."
                 )
             continue
-        if name in groups and joints == 0:
-            continue  # a body without this joint
         values = np.asarray(data[key], np.float64)
         if not np.isfinite(values).all():
             raise ValueError(f"{path}: {key} is not finite.")
@@ -86,7 +71,7 @@ def stack_params(
     """
     absolute = [bool(f.get("flat_hand_mean", flat_hand_mean)) for f in frames]
     arrays: dict[str, Any] = {}
-    for name in _ALIASES:
+    for name in ALIASES:
         if name == "betas" or not any(name in f for f in frames):
             continue
         sizes = [f[name].size if name in f else None for f in frames]

@@ -66,9 +66,7 @@ def load_grab(
     files = find_motions(data_dir)
     subject = None if files else find_subject(data_dir)
     if subject is not None:
-        return load_prepared(
-            subject, body, gender=gender, test=test, split_seed=split_seed, verbose=verbose
-        )
+        return load_prepared(subject, body, gender=gender, test=test, verbose=verbose)
     if not files:
         raise FileNotFoundError(
             f"{data_dir}: no sequences. Looked for train/*.npz and test/*.npz, for *.npz, and for "

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ..body import BodyModel
 from ..motion import load_motion
+from ..motion.values import read_gender
 from .capture import Capture
 from .folder import find_frames, load_folder
 from .grab import find_motions, load_grab
@@ -15,7 +17,8 @@ from .prepared import find_subject, load_prepared
 _LAYOUTS = (
     "train/*.npz and test/*.npz (AMASS or GRAB sequences)",
     "*.npz (a subject's AMASS or GRAB sequences, to be split)",
-    "{train,test}/SEQUENCE/SMPLX/mesh-f*_smplx.{ply,pkl} (prepared), here or one folder down",
+    "{train,test}/SEQUENCE/SMPLX/mesh-f*_smplx.{ply,pkl} (prepared, or X-Humans with meshes_pkl "
+    "beside SMPLX), here or one folder down",
     "NAME.ply|obj beside NAME.npz|pkl (meshes with parameters), subfolders as sequences",
 )
 
@@ -47,14 +50,14 @@ def load_data(
     data_dir = Path(data_dir)
     if not data_dir.is_dir():
         raise FileNotFoundError(f"No data folder at {data_dir}.")
-    options = {"gender": gender, "test": test, "split_seed": split_seed, "verbose": verbose}
+    options: dict[str, Any] = {"gender": gender, "test": test, "verbose": verbose}
     if find_motions(data_dir):
-        return load_grab(data_dir, body, **options)
+        return load_grab(data_dir, body, split_seed=split_seed, **options)
     subject = find_subject(data_dir)
     if subject is not None:
         return load_prepared(subject, body, **options)
     if find_frames(data_dir):
-        return load_folder(data_dir, body, **options)
+        return load_folder(data_dir, body, split_seed=split_seed, **options)
     raise FileNotFoundError(_unknown_layout(data_dir))
 
 
@@ -74,7 +77,7 @@ def find_gender(data_dir: str | Path) -> str | None:
         gender = load_motion(motions[0]).gender
         return None if gender == "unknown" else gender
     file = (find_subject(data_dir) or data_dir) / "gender.txt"
-    return file.read_text(encoding="utf-8").strip().lower() if file.is_file() else None
+    return read_gender(file) if file.is_file() else None
 
 
 def _unknown_layout(data_dir: Path) -> str:

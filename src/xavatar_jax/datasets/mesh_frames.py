@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..body import BodyModel, BodyParams, hands_to_relative, pose_groups
+from ..body import HANDS, BodyModel, BodyParams, hands_to_relative, pose_groups
 from ..files.meshes import read_mesh
 from ..frames import Frames, nearest_part_labels, posed_vertices
 from .capture import one_shape
@@ -47,6 +47,13 @@ def read_params(
         if not given:
             notice = f"{paths[0].parent}: no betas in the parameters: the mean shape is used."
         notices += [notice] if notice else []
+    expression = max((f["expression"].size for f in frames if "expression" in f), default=0)
+    for name, most, known in (
+        ("betas", len(betas), body.num_betas),
+        ("expression", expression, body.num_expression),
+    ):
+        if most > known:
+            notices.append(f"{paths[0].parent}: {most} {name} given, the body has {known}.")
     params = stack_params(frames, paths, body, betas, flat_hand_mean=flat_hand_mean)
     return params, betas, notices
 
@@ -115,7 +122,7 @@ def check_first_frame(frames: Frames, body: BodyModel, *, flat_hand_mean: bool) 
             "large. Check units (metres), axes (the mesh must be in the world of the parameters) "
             "and transl."
         )
-    hands = np.isin(body.part_labels, (2, 3))
+    hands = np.isin(body.part_labels, HANDS)
     if not hands.any() or not np.any(np.asarray(body.hand_mean)):
         return []
     other = tree.query(posed_vertices(body, _other_hands(body, frame.params, flat_hand_mean)))[0]

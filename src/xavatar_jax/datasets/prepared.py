@@ -1,4 +1,4 @@
-"""Subject folders as X-Avatar's preparation writes them from GRAB."""
+"""Subject folders of X-Humans, and those that X-Avatar's preparation writes from GRAB."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..body import BodyModel
+from ..motion.values import read_gender
 from .capture import Capture, notify, resolve_gender
 from .mesh_frames import check_first_frame, mesh_frames, read_params
 
@@ -49,11 +50,12 @@ def load_prepared(
     *,
     gender: str | None = None,
     test: Sequence[str] | None = None,
-    split_seed: int = 0,
     verbose: bool = False,
 ) -> Capture:
     """Load `SUBJECT/{train,test}/SEQUENCE/SMPLX/mesh-fNNNNNN_smplx.{ply,pkl}`.
 
+    Where a sequence has scans beside `SMPLX` (`meshes_pkl/mesh-fNNNNNN.pkl` of X-Humans, or
+    `meshes_ply`, `meshes_obj`), they are what is learned from; textures are not read.
     `gender.txt` and `mean_shape_smplx.npy` lie in the subject's folder; the mean shape takes the
     place of the frames' own betas. Meshes are read when asked for and are y-up already. Hands
     are relative to the mean hand in these files, so the body's mean hand is added.
@@ -63,11 +65,10 @@ def load_prepared(
         body: the body model of the subject's gender.
         gender: takes the place of `gender.txt`.
         test: must be None; the folder is split already.
-        split_seed: not used; the folder is split already.
         verbose: show a progress bar.
 
     Raises:
-        FileNotFoundError: a mesh without parameters, or parameters without a mesh.
+        FileNotFoundError: a mesh or scan without parameters, or parameters without one.
         ValueError: parameters of the wrong shape, a pickle that is more than data, or a gender
             that does not match the body's.
     """
@@ -80,7 +81,7 @@ def load_prepared(
     shape = None
     if shape_file.is_file():
         shape = np.load(shape_file, allow_pickle=False).reshape(-1)[:_NUM_BETAS].astype(np.float64)
-    found = {str(gender_file): _word(gender_file)} if gender_file.is_file() else {}
+    found = {str(gender_file): read_gender(gender_file)} if gender_file.is_file() else {}
     subject_gender, notices = resolve_gender(found, body, gender, subject_dir)
     params, betas, more = read_params(
         both, body, betas=shape, flat_hand_mean=False, verbose=verbose
@@ -106,6 +107,11 @@ def load_prepared(
 def _pairs(folder: Path) -> list[tuple[Path, Path]]:
     meshes = {p.with_suffix(""): p for p in folder.glob(_MESH_PATTERN)}
     params = {p.with_suffix(""): p for p in folder.glob(_PATTERN)}
+    for sequence in sorted({name.parent.parent for name in meshes.keys() | params.keys()}):
+        scans = _scans(sequence)
+        if scans is not None:
+            meshes = {name: p for name, p in meshes.items() if name.parent.parent != sequence}
+            meshes |= scans
     for name in sorted(meshes.keys() ^ params.keys()):
         lacking = ".pkl parameters" if name in meshes else ".ply mesh"
         raise FileNotFoundError(f"{meshes.get(name) or params.get(name)}: no {lacking} beside it.")
@@ -114,9 +120,15 @@ def _pairs(folder: Path) -> list[tuple[Path, Path]]:
     return [(meshes[name], params[name]) for name in sorted(meshes)]
 
 
+def _scans(sequence: Path) -> dict[Path, Path] | None:
+    """Scans of a sequence, if it has a folder of them, by the name of their frame's parameters."""
+    for suffix in ("pkl", "ply", "obj"):
+        folder = sequence / f"meshes_{suffix}"
+        if folder.is_dir():
+            found = folder.glob(f"mesh-f*.{suffix}")
+            return {sequence / "SMPLX" / f"{p.stem}_smplx": p for p in found}
+    return None
+
+
 def _sequence(mesh: Path) -> str:
     return mesh.parent.parent.name
-
-
-def _word(path: Path) -> str:
-    return path.read_text(encoding="utf-8").strip().lower()

@@ -15,7 +15,7 @@ from .influences import limit_influences
 from .rig import Clip, Rig, rotation_quaternions
 
 Color = tuple[float, float, float]
-SKIN_COLOR: Color = (0.60, 0.40, 0.30)  # linear light, as glTF counts
+SKIN_COLOR_LINEAR: Color = (0.60, 0.40, 0.30)  # linear light, as glTF counts
 _TYPES = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
 _VERTEX_DATA, _INDEX_DATA = 34962, 34963
 
@@ -26,7 +26,7 @@ def write_glb(
     clips: Sequence[Clip] = (),
     *,
     influences: Literal[4, 8] = 4,
-    base_color: Color = SKIN_COLOR,
+    base_color: Color = SKIN_COLOR_LINEAR,
 ) -> None:
     """Write a rig and its clips as one `.glb` file (glTF 2.0, section 3.7.3 on skins).
 
@@ -55,7 +55,7 @@ def glb_bytes(
     clips: Sequence[Clip] = (),
     *,
     influences: Literal[4, 8] = 4,
-    base_color: Color = SKIN_COLOR,
+    base_color: Color = SKIN_COLOR_LINEAR,
 ) -> bytes:
     """The contents of the file that `write_glb` writes."""
     import pygltflib

@@ -91,7 +91,7 @@ def _ply_colors(path: str, count: int) -> np.ndarray | None:
         return None
     import trimesh
 
-    visual = trimesh.load_mesh(path, process=False).visual
+    visual = trimesh.load_mesh(path, process=False, fix_texture=False).visual
     if visual is None or visual.kind != "vertex":
         return None
     colors = np.asarray(visual.vertex_colors, dtype=np.uint8)  # pyright: ignore

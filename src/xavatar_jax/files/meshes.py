@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from .unpickle import load_pickle
+
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
 _KEEP_ORDER = {"process": False, "maintain_order": True, "skip_materials": True}
@@ -20,7 +22,8 @@ def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarra
     Vertex order matters: labels and skinning weights refer to it. Polygons become triangles.
 
     Args:
-        path: a PLY, OBJ, GLB, STL or OFF file.
+        path: a PLY, OBJ, GLB, STL or OFF file, or a pickle of arrays `vertices` and `faces`, as
+            the scans of X-Humans are.
 
     Returns:
         Vertices, float32, in the units of the file; triangles as vertex indices, int32.
@@ -35,16 +38,20 @@ def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarra
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"No mesh file at {path}.")
+    if path.suffix.lower() == ".pkl":
+        return _pickled_mesh(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ValueError(
             f"{path}: cannot read a mesh from a {path.suffix or 'suffix-less'} file; "
-            f"readable are {', '.join(MESH_SUFFIXES)}."
+            f"readable are {', '.join(MESH_SUFFIXES)}, .pkl."
         )
     try:
         if path.suffix.lower() == ".obj":
             loaded = trimesh.load_mesh(_obj_geometry(path), file_type="obj", **_KEEP_ORDER)
         else:
-            loaded = trimesh.load_mesh(path, process=False)
+            # Texture coordinates of a PLY file would split and reorder vertices, too.
+            whole = {"fix_texture": False} if path.suffix.lower() == ".ply" else {}
+            loaded = trimesh.load_mesh(path, process=False, **whole)
     except Exception as error:
         # trimesh raises whatever its parsers raise: one readable error instead.
         raise ValueError(
@@ -54,6 +61,17 @@ def read_mesh(path: str | Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarra
     faces = np.asarray(getattr(loaded, "faces", ()), np.int32).reshape(-1, 3)
     check_mesh(vertices, faces, str(path))
     return vertices, faces
+
+
+def _pickled_mesh(path: Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    data = load_pickle(path)
+    missing = [n for n in ("vertices", "faces") if not isinstance(data, dict) or n not in data]
+    if missing:
+        held = ", ".join(map(str, data)) if isinstance(data, dict) else type(data).__name__
+        raise ValueError(f"{path}: no {' and no '.join(missing)}; it holds {held}.")
+    vertices, faces = np.asarray(data["vertices"], np.float32), np.asarray(data["faces"])
+    check_mesh(vertices, faces, str(path))
+    return vertices, faces.astype(np.int32)
 
 
 def _obj_geometry(path: Path) -> io.StringIO:

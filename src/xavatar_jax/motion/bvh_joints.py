@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ..body import SMPLX_TREE
+from ..body import SMPLX_TREE, pose_groups
 
 _FINGERS = ("Index", "Middle", "Pinky", "Ring", "Thumb")
 
@@ -50,6 +50,8 @@ JOINT_MAPS: dict[str, dict[str, str]] = {
     },
 }
 """Names in a BVH file, without a prefix such as `mixamorig:`, to names of SMPL-X, by skeleton."""
+_GROUPS = pose_groups(SMPLX_TREE)
+_BODY_JOINTS = {SMPLX_TREE.names[j] for j in _GROUPS["global_orient"] + _GROUPS["body_pose"]}
 # Without these nothing can be said about where the person stands or what the limbs do.
 NEEDED = (
     "pelvis", "head", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle",
@@ -66,7 +68,7 @@ def match_joints(
     Args:
         names: of the file's joints.
         joint_map: a key of `JOINT_MAPS`, names of the file to names of SMPL-X, or None to take
-            the map that fits most joints.
+            the map that fits most joints of the body.
         where: file, for messages.
 
     Raises:
@@ -74,8 +76,12 @@ def match_joints(
     """
     plain = [_plain(name) for name in names]
     if joint_map is None:
-        # The first of equals wins: maps are listed from the most specific.
-        title = max(JOINT_MAPS, key=lambda key: sum(name in JOINT_MAPS[key] for name in plain))
+        # By the joints of the body: several kinds of file share names of fingers. The first of
+        # equals wins.
+        def fit(title: str) -> int:
+            return sum(JOINT_MAPS[title].get(name) in _BODY_JOINTS for name in plain)
+
+        title = max(JOINT_MAPS, key=fit)
         chosen: Mapping[str, str] = JOINT_MAPS[title]
     elif isinstance(joint_map, str):
         if joint_map not in JOINT_MAPS:

@@ -29,7 +29,7 @@ from .values import (
     rotation_vectors,
 )
 
-_ALIASES = {
+ALIASES = {
     "global_orient": ("global_orient", "root_orient"),
     "body_pose": ("body_pose", "pose_body"),
     "jaw_pose": ("jaw_pose", "pose_jaw"),
@@ -41,6 +41,7 @@ _ALIASES = {
     "betas": ("betas", "shape"),
     "expression": ("expression", "expressions"),
 }
+"""What files call the parameters of SMPL-X."""
 _GROUPS = pose_groups(SMPLX_TREE)
 _HANDS: dict[str, Side] = {"left_hand_pose": "left", "right_hand_pose": "right"}
 
@@ -77,7 +78,7 @@ def read_frames(
     """
     found = {
         name: next((data[alias] for alias in aliases if data.get(alias) is not None), None)
-        for name, aliases in _ALIASES.items()
+        for name, aliases in ALIASES.items()
     }
     missing = [name for name in ("global_orient", "body_pose") if found[name] is None]
     if missing:
@@ -154,6 +155,18 @@ def to_motion(
     )
 
 
+def read_named(file: Path) -> dict[str, Any]:
+    """What a pickle or an archive holds, by name.
+
+    Raises:
+        ValueError: it holds something else.
+    """
+    data = load_npz(file) if file.suffix.lower() == ".npz" else load_pickle(file)
+    if not isinstance(data, dict):
+        raise ValueError(f"{file}: holds a {type(data).__name__}, not parameters by name.")
+    return data
+
+
 def read_files(
     files: Sequence[Path], options: ReadOptions, notices: list[str], *, relative: bool = True
 ) -> Frames:
@@ -164,10 +177,7 @@ def read_files(
     """
     parts = []
     for file in files:
-        data = load_npz(file) if file.suffix.lower() == ".npz" else load_pickle(file)
-        if not isinstance(data, dict):
-            raise ValueError(f"{file}: holds a {type(data).__name__}, not parameters by name.")
-        part = read_frames(data, file, options, notices, relative=relative)
+        part = read_frames(read_named(file), file, options, notices, relative=relative)
         if len(part.poses) != 1:
             raise ValueError(f"{file}: {len(part.poses)} frames, where a file holds one.")
         for name in ("betas", "expression"):

@@ -257,3 +257,8 @@ def text(value: Any) -> str:
 def listing(keys: Any) -> str:
     """Names of entries, for messages."""
     return ", ".join(sorted(map(str, keys))) or "nothing"
+
+
+def read_gender(file: Path) -> str:
+    """The gender that a `gender.txt` states."""
+    return file.read_text(encoding="utf-8").strip().lower()

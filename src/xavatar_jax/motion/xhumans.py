@@ -15,6 +15,7 @@ from .format import Format, ReadOptions, Source
 from .params import numbered, read_files, to_motion
 from .record import Motion
 from .resampling import fill_gaps
+from .values import read_gender
 
 _PATTERN = r"mesh-f(\d+)_smplx\.pkl"
 
@@ -38,7 +39,7 @@ def _read(source: Source, options: ReadOptions) -> Motion:
         notices,
         up=options.up or "y",
         betas=None if shape is None else _mean_shape(shape),
-        gender="unknown" if gender is None else gender.read_text("utf-8").strip().lower(),
+        gender="unknown" if gender is None else read_gender(gender),
     )
     return fill_gaps(motion, list(files))
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..parts import BODY, EYES_MOUTH, FACE, LEFT_HAND, RIGHT_HAND
 from .head import EYE, MOUTH, MOUTH_HALF_WIDTH, hair_edge
 from .sizing import WRIST_X
-
-BODY, FACE, LEFT_HAND, RIGHT_HAND, EYES_MOUTH = range(5)
 
 
 def part_labels(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:

@@ -102,8 +102,7 @@ def _bump(p: np.ndarray, centre: tuple, radii: tuple) -> np.ndarray:
 
 def _local(name: str, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Bumps of the surface that no bone explains."""
-    p = vertices * np.array([1.0, 1.0, 1.0])
-    p = np.concatenate([np.abs(p[:, :1]), p[:, 1:]], 1)
+    p = np.concatenate([np.abs(vertices[:, :1]), vertices[:, 1:]], 1)
     amount = np.zeros(len(p))
     if name == "weight":
         amount += 0.008 * _bump(p, (0.0, -0.25, 0.06), (0.10, 0.09, 0.08))

@@ -11,31 +11,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+from ..joints import FINGERS, SMPLX_TREE
 
-# fmt: off
-_BODY_NAMES = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2",
-    "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar",
-    "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow",
-    "left_wrist", "right_wrist", "jaw", "left_eye", "right_eye",
-)
-# fmt: on
-
-JOINT_NAMES: tuple[str, ...] = (
-    *_BODY_NAMES,
-    *(f"left_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)),
-    *(f"right_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)),
-)
-
-# fmt: off
-PARENTS: tuple[int, ...] = (
-    -1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15,
-    20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38,
-    21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53,
-)
-# fmt: on
-
+JOINT_NAMES, PARENTS = SMPLX_TREE.names, SMPLX_TREE.parents
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 _MIDLINE_AND_LEFT = {
@@ -105,15 +83,6 @@ def rest_joints() -> Float[np.ndarray, "55 3"]:
         if name.startswith("left_"):
             places["right_" + name[5:]] = places[name] * mirror
     return np.stack([places[name] for name in JOINT_NAMES])
-
-
-def subtree(joint: int) -> list[int]:
-    """The joint and everything below it."""
-    members = [joint]
-    for child in range(joint + 1, len(PARENTS)):
-        if PARENTS[child] in members:
-            members.append(child)
-    return members
 
 
 def mirrored_joint(joint: int) -> int:

@@ -10,8 +10,9 @@ class Edges:
     """Unique undirected edges of a mesh and the faces at them.
 
     pairs: (E, 2) with the smaller index first; of_face: (F, 3), edge k of a face joins corners k
-    and k + 1; faces: (E, 2) the two faces at an edge and corners: (E, 2) the corner of each that
-    faces the edge (only meaningful when every edge has two faces).
+    and k + 1; count: (E,) faces at an edge. Where every edge has two, half: (E, 2) are its places
+    in `of_face` read row by row, faces: (E, 2) those faces, and opposite: (E, 2) the vertex of
+    each that is not on the edge.
     """
 
     def __init__(self, faces: Int[np.ndarray, "F 3"]):
