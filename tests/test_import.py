@@ -10,7 +10,7 @@ from pathlib import Path
 
 import xavatar_jax
 
-HEAVY = ("trimesh", "scipy.spatial", "scipy.ndimage", "skimage", "igl", "embreex", "PIL", "viser",
+HEAVY = ("trimesh", "scipy.spatial", "scipy.ndimage", "igl", "embreex", "PIL", "viser",
          "torch", "pygltflib", "matplotlib")  # fmt: skip
 # In the same run, on the same machine: what the library adds to its own solver library.
 ALLOWED_RATIO = 1.5

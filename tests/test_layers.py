@@ -19,7 +19,7 @@ LAYERS = (
 OUTSIDE = {"__init__", "__main__", "cli", "_version"}
 # Loaded by the functions that use them, since each takes long to import.
 HEAVY = {
-    *("trimesh", "scipy", "skimage", "igl", "embreex", "PIL", "pygltflib", "viser", "torch"),
+    *("trimesh", "scipy", "igl", "embreex", "PIL", "pygltflib", "viser", "torch"),
     *("tyro", "matplotlib"),
 }
 FILES = sorted(SOURCE.rglob("*.py"))

@@ -265,7 +265,7 @@ def test_importing_loads_no_heavy_library():
     code = (
         "import sys\n"
         "from xavatar_jax import export, geometry, meshing, metrics, render\n"
-        "heavy = {'trimesh', 'scipy', 'skimage', 'igl', 'embreex', 'PIL', 'pygltflib', 'viser'}\n"
+        "heavy = {'trimesh', 'scipy', 'igl', 'embreex', 'PIL', 'pygltflib', 'viser'}\n"
         "before = set(sys.modules) & heavy\n"
         "print(sorted(before))\n"
     )

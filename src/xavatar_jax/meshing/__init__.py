@@ -1,6 +1,5 @@
 """Triangle meshes, and their extraction from level sets."""
 
-from .dense import marching_cubes as marching_cubes
 from .extract import extract_surface as extract_surface
 from .mesh import Mesh as Mesh
 from .mesh import connected_components as connected_components
