@@ -1,6 +1,7 @@
 """Learn an avatar of one person from posed meshes, and test it on motion it has not seen.
 
-Without arguments: the bundled body and capture, the quick preset, ten minutes on two CPU cores.
+Without arguments: the bundled body and capture and the preset `quick`, in less than ten minutes on
+two CPU cores.
 
     python examples/fit_grab.py
     python examples/fit_grab.py --model-dir MODELS --data GRAB_SUBJECT --out out/s1

@@ -43,6 +43,17 @@ def test_round_trip_keeps_what_expressions_do(run, tmp_path):
     assert np.abs(vertices - avatar.mesh(neutral).vertices).max() > 0.002
 
 
+def test_round_trip_keeps_weights_that_a_run_did_not_learn(run, tmp_path):
+    """Another run has: the fields went on from there."""
+    fields, config = run.fit.avatar.fields, run.config
+    moved = eqx.tree_at(lambda f: f.skinning.correction, fields, replace_fn=lambda c: c + 0.3)
+    config = replace(config, skinning=replace(config.skinning, learned=False))
+    avatar = replace(run.fit.avatar, fields=moved, config=config)
+    avatar.save(tmp_path / "avatar.npz")
+    again = xa.load_avatar(tmp_path / "avatar.npz", body=run.body)
+    assert np.array_equal(again.fields.skinning.correction, moved.skinning.correction)
+
+
 def test_body_is_found_by_its_path(run, saved):
     assert xa.load_avatar(saved).body.source == run.body.source
 

@@ -153,12 +153,12 @@ def loud(geometry, rng):
 
 
 @pytest.mark.parametrize("smile", [0.0, 1.0])
-def test_what_is_audible_gives_the_same_logits(bundled_body, vertices, loud, rng, smile):
+def test_a_condition_without_zeros_gives_the_same_logits(bundled_body, vertices, loud, rng, smile):
     pose = np.zeros((55, 3))
     pose[[4, 22, 30]] = rng.normal(size=(3, 3))
     expression = smile * rng.normal(size=10)
     full = loud.condition(BodyParams.create(bundled_body, pose=pose, expression=expression))
-    kept = loud.audible(full)
+    kept = loud.without_zeros(full)
     assert len(kept.joints) == 3
     assert len(kept.expression) == 10 * smile
     points = jnp.asarray(vertices[::100], jnp.float32)

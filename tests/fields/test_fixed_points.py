@@ -29,7 +29,7 @@ def random_geometry(body, kind: str):
     leaves = [x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
     loud = eqx.combine(jax.tree.unflatten(structure, leaves), rest)
     if kind == "hash":
-        loud = eqx.tree_at(lambda g: g.told, loud, geometry.told)
+        loud = eqx.tree_at(lambda g: g.fixed_leaves, loud, geometry.fixed_leaves)
     return loud
 
 

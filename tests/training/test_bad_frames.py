@@ -13,8 +13,8 @@ from small_runs import posed_frames, tiny
 
 import xavatar_jax as xa
 from xavatar_jax.geometry import winding_number
-from xavatar_jax.training import TrainingNotice, choose_frames
-from xavatar_jax.training.check import FrameCheck
+from xavatar_jax.training import TrainingNotice, choose_frames, loop
+from xavatar_jax.training.check import FrameCheck, check_found
 from xavatar_jax.training.pool import label_frames
 from xavatar_jax.training.progress import progress
 
@@ -132,7 +132,7 @@ def test_constant_poses(case):
 def test_notices_are_kept_with_the_run(case, no_prefit, tmp_path):
     """In its history, and in that of a run that goes on from its checkpoint."""
     body, frames, config, _, _ = case
-    moved = np.array([0.2, 0, 0])
+    moved = np.array([0.12, 0, 0])
     wrong = with_meshes(frames, lambda k, v, f: (v + moved * (k == 1), f[:, ::-1] if k else f))
     kept = {"checkpoint": tmp_path / "run.npz", "body": body, "verbose": False}
     config = replace(config, steps=1)  # all is said before it
@@ -188,3 +188,65 @@ def test_memory_knows_the_frames_chosen_and_not_how_many_there_are(case):
     assert pool_of(3000) == pool_of(300)
     assert len(read) == config.train_frames + config.validation.frames
     assert most[0] <= 1
+
+
+def test_a_frame_far_from_its_parameters_is_named_and_teaches_nothing(case, no_prefit):
+    body, frames, config, _, _ = case
+    config = replace(config, steps=2, report_every=1)
+
+    def shifted(metres):
+        moved = with_meshes(frames, lambda k, v, f: (v + np.array([metres * (k == 1), 0, 0]), f))
+        with pytest.warns(TrainingNotice) as said:
+            done = xa.fit(moved, config, body=body, verbose=False)
+        words = "1 of 3 frames have no point that was found on the body"
+        assert any(words in str(w.message) and "scan_1" in str(w.message) for w in said)
+        return done.history.terms
+
+    near, far = shifted(5.0), shifted(50.0)
+    assert near["occupancy"] == far["occupancy"]
+
+
+def test_frames_that_are_all_far_from_their_parameters_are_refused(case, no_prefit):
+    body, frames, config, _, _ = case
+    moved = with_meshes(frames, lambda k, v, f: (v + 5.0, f))
+    with (
+        pytest.warns(TrainingNotice, match="do not fit"),
+        pytest.raises(ValueError, match=r"no point of any frame.*scan_0, scan_1, scan_2.*units"),
+    ):
+        xa.fit(moved, config, body=body, verbose=False)
+
+
+def test_points_beyond_the_grids_are_counted(case):
+    frames = case[1]
+    check_found(frames, np.array([100, 95, 90]), 100, None)
+    kept = []
+    with pytest.warns(TrainingNotice, match="30% of the points were not found"):
+        check_found(frames, np.array([70, 70, 70]), 100, kept)
+    assert len(kept) == 1
+
+
+def test_one_person_has_one_shape(case, no_prefit, monkeypatch):
+    """Frames fitted one by one, each with betas of its own: their mean is everybody's."""
+    body, frames, config, _, _ = case
+    betas = np.random.default_rng(0).normal(size=(3, 10)).astype(np.float32)
+    params = replace(frames.params, betas=betas)
+    seen = []
+
+    def stop(_, frames, *rest, **options):
+        seen.append(frames)
+        raise KeyError("seen enough")
+
+    monkeypatch.setattr(loop, "label_frames", stop)
+    with (
+        pytest.warns(TrainingNotice, match=r"betas differ from frame to frame, by up to \d"),
+        pytest.raises(KeyError, match="seen enough"),
+    ):
+        xa.fit(frames.with_params(params), config, body=body, verbose=False)
+    np.testing.assert_allclose(seen[0].params.betas, np.tile(betas.mean(0), (3, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("minutes", [0, -1.0, float("nan")])
+def test_budgets_are_positive(case, minutes):
+    body, frames, config, _, _ = case
+    with pytest.raises(ValueError, match="minutes must be a positive number"):
+        xa.fit(frames, replace(config, minutes=minutes), body=body)

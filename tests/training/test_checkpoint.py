@@ -159,7 +159,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(job, whole, tmp_path):
 
 def test_nothing_to_go_on_from_is_said(job, tmp_path):
     call, _, config = job
-    short = replace(config, minutes=0.0)
+    short = replace(config, minutes=1e-6)
     with pytest.warns(TrainingNotice, match=r"no checkpoint at .*run\.npz: .* step 0"):
         done = call(config=short, checkpoint=tmp_path / "run.npz", resume=True)
     assert "begins at step 0" in done.history.notices[0]
@@ -241,13 +241,21 @@ def spoilt_at(step, seed):
     return spoilt
 
 
-def test_a_loss_that_is_not_finite_keeps_the_last_good_state(job, tmp_path, other_objective):
-    """In the seventh step: the state kept is that after six."""
+@pytest.mark.parametrize("skinning_every", [4, 7])
+def test_a_loss_that_is_not_finite_keeps_the_last_good_state(
+    job, tmp_path, other_objective, skinning_every
+):
+    """In the seventh step: the state kept is that after six, whatever kind the eighth is of."""
     call, _, config = job
+    config = replace(config, skinning_every=skinning_every)
     other_objective(spoilt_at(6, config.seed))
     path, seen = tmp_path / "run.npz", {}
     with pytest.raises(TrainingError, match=r"occupancy term is nan at step 7.*run\.npz") as error:
-        call(checkpoint=path, callback=lambda step, fields, terms: seen.update({step: fields}))
+        call(
+            config=config,
+            checkpoint=path,
+            callback=lambda step, fields, terms: seen.update({step: fields}),
+        )
     assert error.value.step == 7
     assert error.value.term == "occupancy"
     assert error.value.fitted.history.steps_done == 6

@@ -65,6 +65,9 @@ found = {
     "paper": run(xa.paper(), 2, 0),
     "guided": run(replace(xa.quick(), search=search), 2, 1),
 }
+third = share_work(xa.quick(), jax.devices()[2:3])
+placed = third.replicate(jnp.ones(3))
+found["third"] = [str(third.first), [str(d) for d in placed.devices()], third.count]
 print("RESULT", json.dumps(found))
 """
 
@@ -107,6 +110,15 @@ def test_four_devices_give_the_losses_of_one(results, preset, mesh):
     assert one["devices"] == four["devices"] == 1  # what comes back is on one device
     np.testing.assert_allclose(four["losses"], one["losses"], rtol=1e-4)
     np.testing.assert_allclose(four["validation"], one["validation"], rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_one_device_may_be_any(results):
+    """Not the first of the machine alone."""
+    first, placed, count = results["third"]
+    assert placed == [first]
+    assert first.endswith("2") or "id=2" in first
+    assert count == 1
 
 
 def test_one_device_is_left_as_it_is():

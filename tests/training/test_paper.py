@@ -122,7 +122,8 @@ def small(family, x64):
     none = np.zeros((2, 0, 0))
     batch = Batch(
         *(jnp.asarray(v) for v in (points, parts, rng.normal(size=(2, 30)), 0 * points)),
-        jnp.zeros((*none.shape, 3)), jnp.asarray(none, bool), jnp.asarray(bones), params,
+        jnp.ones((2, 30), bool), jnp.zeros((*none.shape, 3)), jnp.asarray(none, bool),
+        jnp.asarray(bones), params,
     )  # fmt: skip
     return body, AvatarFields(skinning, geometry), batch
 

@@ -1,6 +1,7 @@
 """Steps, draws, determinism and failure of training, on pools made by hand."""
 
 import json
+import time
 from dataclasses import replace
 
 import equinox as eqx
@@ -22,9 +23,14 @@ from xavatar_jax.training import (
 )
 from xavatar_jax.training import step as step_module
 from xavatar_jax.training.loop import train_pool
+from xavatar_jax.training.objective import (
+    geometry_objective,
+    make_anchors,
+    skinning_objective,
+)
 from xavatar_jax.training.pool import label_frames, polish_roots, tabulate_for_search
 from xavatar_jax.training.progress import progress
-from xavatar_jax.training.step import draw_batch
+from xavatar_jax.training.step import batch_of, draw_batch
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
@@ -84,6 +90,30 @@ def test_batches_take_only_points_with_roots(case):
     frame, row = np.divmod(rows, pool.points.shape[1])
     assert (row < np.asarray(pool.found)[frame]).all()
     assert batch.others.shape[:2] == (2, 8)
+
+
+def test_points_without_a_root_count_for_nothing(case):
+    """Of a frame in which none was found: wherever they stand, losses and slopes are the same."""
+    body, _, config, fields, pool = case
+    lost = eqx.tree_at(
+        lambda p: (p.found, p.several), pool, (pool.found.at[1].set(0), pool.several.at[1].set(0))
+    )
+    batch = batch_of(lost, jnp.array([0, 1]), 64, 8, *jax.random.split(jax.random.key(0)))
+    assert np.asarray(batch.rooted).all(axis=1).tolist() == [True, False]
+    assert not np.asarray(batch.rooted[1]).any()
+    elsewhere = batch._replace(root=jnp.where(batch.rooted[..., None], batch.root, 7.0))
+    anchors = make_anchors(body, jnp.zeros(10), config)
+    for objective in (geometry_objective, skinning_objective):
+
+        def loss(learned, batch, objective=objective):
+            found = eqx.combine(learned, fields)
+            return objective(found, batch, anchors, config, jax.random.key(1))[0]
+
+        slope = eqx.filter_jit(jax.value_and_grad(loss))
+        learned = eqx.filter(fields, trainable_filter(fields, config))
+        one, other = slope(learned, batch), slope(learned, elsewhere)
+        assert jax.tree.all(jax.tree.map(np.array_equal, one, other))
+        assert float(one[0]) > 0
 
 
 @pytest.fixture(scope="module")
@@ -150,10 +180,11 @@ def test_a_loss_that_is_not_finite_names_its_term(case):
         train_pool(body, fields, bad, np.zeros(10), config, verbose=False)
 
 
-def test_a_budget_of_seconds_ends_training(case):
+def test_a_deadline_ends_training(case):
     body, _, config, fields, pool = case
     config = replace(config, steps=100_000)
-    done = train_pool(body, fields, pool, np.zeros(10), config, seconds=0.5, verbose=False)
+    deadline = time.perf_counter() + 0.5
+    done = train_pool(body, fields, pool, np.zeros(10), config, deadline=deadline, verbose=False)
     assert done.history.steps_done < 5000
 
 

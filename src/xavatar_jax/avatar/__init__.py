@@ -1,9 +1,8 @@
 """Avatars: fit, query, pose, evaluate, save and load."""
 
 from .animate import Animation as Animation
-from .animate import AnimationError as AnimationError
+from .animate import AnimationAccuracy as AnimationAccuracy
 from .avatar import Avatar as Avatar
-from .avatar import CellSizes as CellSizes
 from .evaluate import Evaluation as Evaluation
 from .evaluate import Posable as Posable
 from .evaluate import evaluate as evaluate
@@ -13,3 +12,4 @@ from .query import Query as Query
 from .rigging import GlbExport as GlbExport
 from .store import load_avatar as load_avatar
 from .store import load_avatar_body as load_avatar_body
+from .surface import CellSizes as CellSizes

@@ -28,15 +28,14 @@ from ..geometry import closest_points
 from ..meshing import Mesh
 from ..training import AvatarFields
 from ..training.progress import progress
-from .pointwise import batch_size, gradients, in_batches, skin_weights
+from .pointwise import PROJECT_STEP, PROJECT_STEPS, batch_size, gradients, in_batches, skin_weights
 
 if TYPE_CHECKING:
     from .avatar import Avatar
 
 Offsets = Literal["cached", "exact", "none"]
 DEFAULT_FPS = 30.0
-# As far as the exact way goes: three steps of three millimetres.
-_LARGEST_STEP = 0.009
+_LARGEST_STEP = PROJECT_STEPS * PROJECT_STEP  # as far as the exact way goes
 _FRAME_BLOCK = 64
 
 
@@ -53,7 +52,7 @@ class MotionLike(Protocol):
     def to_params(self, body: BodyModel) -> BodyParams: ...
 
 
-class PosableBase(eqx.Module):
+class NeutralSurface(eqx.Module):
     """The neutral surface, and what of it is the same in every frame. Vertices are columns.
 
     - `vertices`: metres, canonical space; `normals`: unit gradients of the field, inwards.
@@ -90,7 +89,7 @@ class Spread(NamedTuple):
 
 
 @dataclass(frozen=True)
-class AnimationError:
+class AnimationAccuracy:
     """How far animated frames lie from those that `Avatar.mesh` gives, millimetres.
 
     - `vertex`: between vertices of the same number, sliding along the surface included.
@@ -169,8 +168,8 @@ class Animation:
                 bar.update(1)
         return out
 
-    def error(self, num_frames: int = 8, *, verbose: bool = False) -> AnimationError:
-        """Compare `num_frames`, evenly spread, with the frames' own meshes: see `AnimationError`.
+    def error(self, num_frames: int = 8, *, verbose: bool = False) -> AnimationAccuracy:
+        """Compare `num_frames`, evenly spread, with the frames' own meshes.
 
         **Raises:** `ValueError` in full mode.
         """
@@ -183,7 +182,9 @@ class Animation:
                 between.append(np.linalg.norm(fast - own.vertices, axis=1))
                 away.append(closest_points(own.vertices, own.faces, fast)[0])
                 bar.update(1)
-        return AnimationError(Spread.of(np.stack(between)), Spread.of(np.stack(away)), len(chosen))
+        return AnimationAccuracy(
+            Spread.of(np.stack(between)), Spread.of(np.stack(away)), len(chosen)
+        )
 
     def export_sequence(
         self,
@@ -212,7 +213,9 @@ class Animation:
             return self.avatar.mesh(self.params[index]).vertices
         drive = self.drive
         condition, transforms = jax.tree.map(lambda leaf: leaf[index], drive)
-        posed = posed_vertices(self.avatar.posable, condition, transforms, self.offsets == "cached")
+        posed = posed_vertices(
+            self.avatar.neutral_surface, condition, transforms, self.offsets == "cached"
+        )
         return np.asarray(posed)
 
     @cached_property
@@ -275,7 +278,7 @@ def spread_frames(count: int, wanted: int) -> Int[np.ndarray, " n"]:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
 
 
-def posable_base(avatar: Avatar) -> PosableBase:
+def neutral_surface(avatar: Avatar) -> NeutralSurface:
     """What `animate` keeps of an avatar: the neutral surface, its gradients and weights."""
     neutral = canonical_params(avatar.body, jnp.asarray(avatar.betas))
     # Vertices of the extracted surface lie on its cells' planes: here on the level set itself.
@@ -284,7 +287,7 @@ def posable_base(avatar: Avatar) -> PosableBase:
     condition = fields.geometry.condition(neutral)
     gradient = in_batches(lambda x: gradients(fields, x, condition), points, batch)
     slopes = np.maximum(np.linalg.norm(gradient, axis=1), 1e-6)
-    return PosableBase(
+    return NeutralSurface(
         vertices=jnp.asarray(points.T),
         normals=jnp.asarray((gradient / slopes[:, None]).T),
         slopes=jnp.asarray(slopes),
@@ -297,7 +300,7 @@ _at = eqx.filter_jit(lambda fields, points: fields.geometry.at(points))
 
 
 @eqx.filter_jit
-def offset_vertices(base: PosableBase, condition: Any) -> Float[Array, "3 V"]:
+def offset_vertices(base: NeutralSurface, condition: Any) -> Float[Array, "3 V"]:
     """The base on the surface of one condition, to first order: a step along its own normal.
 
     From where the condition carries it.
@@ -309,7 +312,7 @@ def offset_vertices(base: PosableBase, condition: Any) -> Float[Array, "3 V"]:
 
 @eqx.filter_jit
 def posed_vertices(
-    base: PosableBase, condition: Any, transforms: Float[Array, "J 4 4"], offset: bool
+    base: NeutralSurface, condition: Any, transforms: Float[Array, "J 4 4"], offset: bool
 ) -> Float[Array, "V 3"]:
     """Vertices of one frame, metres: offset by the frame's condition if asked, then skinned."""
     points = offset_vertices(base, condition) if offset else base.vertices
@@ -337,7 +340,9 @@ def posed_frame(avatar: Avatar, params: BodyParams) -> Float[np.ndarray, "V 3"]:
     """
     own = own_batch(avatar, params, "parameters")[0]
     drive = _drive_frame(avatar.fields, avatar.body, own)
-    return np.asarray(posed_vertices(avatar.posable, drive.conditions, drive.transforms, True))
+    return np.asarray(
+        posed_vertices(avatar.neutral_surface, drive.conditions, drive.transforms, True)
+    )
 
 
 _drive_frame = eqx.filter_jit(

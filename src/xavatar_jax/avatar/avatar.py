@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -14,9 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from ..body import (
-    BODY,
-    FACES,
-    HANDS,
     BodyModel,
     BodyParams,
     bone_transforms,
@@ -28,11 +25,10 @@ from ..body import (
 )
 from ..correspondence import RowFinder, StartSet
 from ..fields import TabulatedSkinning
-from ..geometry import nearest_vertices
-from ..meshing import Mesh, extract_surface
+from ..meshing import Mesh
 from ..training import AvatarFields, FitConfig
 from ..training.pool import tabulate_for_search
-from .animate import Animation, MotionLike, Offsets, PosableBase, animate, posable_base
+from .animate import Animation, MotionLike, NeutralSurface, Offsets, animate, neutral_surface
 from .pointwise import (
     batch_size,
     in_batches,
@@ -44,22 +40,7 @@ from .pointwise import (
 )
 from .query import Query, query_posed
 from .rigging import GlbExport, Motions, export_glb, export_weights
-
-MAX_VERTICES = 50_000
-
-
-@dataclass(frozen=True)
-class CellSizes:
-    """Edges of extraction cells by part, metres."""
-
-    body: float = 0.008
-    head: float = 0.004
-    face: float = 0.002
-    hands: float = 0.002
-
-    def scaled(self, factor: float) -> CellSizes:
-        """All sizes times `factor`."""
-        return CellSizes(*(factor * v for v in (self.body, self.head, self.face, self.hands)))
+from .surface import MAX_VERTICES, CellSizes, extract_around
 
 
 @dataclass(frozen=True)
@@ -253,9 +234,9 @@ class Avatar:
         return tabulate_for_search(self.body, self.betas, self.fields.skinning, self.config)
 
     @cached_property
-    def posable(self) -> PosableBase:
+    def neutral_surface(self) -> NeutralSurface:
         """What `animate` keeps between frames and motions, made on first use."""
-        return posable_base(self)
+        return neutral_surface(self)
 
     @cached_property
     def _base_mesh(self) -> Mesh:
@@ -277,21 +258,27 @@ class Avatar:
     def _extract_canonical(self, cell: CellSizes | float | None, max_vertices: int | None) -> Mesh:
         neutral = canonical_params(self.body, jnp.asarray(self.betas))
         geometry = self.fields.geometry
-        condition = geometry.audible(geometry.condition(neutral))
+        condition = geometry.without_zeros(geometry.condition(neutral))
 
         def field(points: np.ndarray) -> np.ndarray:
             return np.asarray(logits(self.fields, jnp.asarray(points), condition))
 
-        template, batch = self._canonical_vertices, batch_size(self.config)
-        return self._extract(
-            field, template, cell, max_vertices, batch, edge_steps=0, project_steps=1
+        return extract_around(
+            self.body,
+            self._canonical_vertices,
+            field,
+            cell,
+            max_vertices,
+            margin=self.config.skinning.grid.band,
+            batch=batch_size(self.config),
+            edge_steps=0,
+            project_steps=1,
         )
 
     def _extract_posed(
         self, params: BodyParams, cell: CellSizes | float | None, max_vertices: int | None
     ) -> Mesh:
         template = self.posed_template(params)
-        batch = 4096
         finder = self._row_finder(template)
 
         def field(points: np.ndarray) -> np.ndarray:
@@ -299,51 +286,15 @@ class Avatar:
             # Nowhere to be found is outside, by about the width of the learned step.
             return np.asarray(jnp.where(answer.found, answer.logit, -10.0))
 
-        return self._extract(field, template, cell, max_vertices, batch)
-
-    def _extract(
-        self,
-        field: Any,
-        template: np.ndarray,
-        cell: CellSizes | float | None,
-        max_vertices: int | None,
-        batch: int,
-        edge_steps: int = 2,
-        project_steps: int = 0,
-    ) -> Mesh:
-        sizes = CellSizes() if cell is None else cell
-        if not isinstance(sizes, CellSizes):
-            sizes = CellSizes(sizes, sizes, sizes, sizes)
-        wanted = self._cells_by_vertex(sizes)
-
-        def cell_at(points: np.ndarray) -> np.ndarray:
-            return wanted[nearest_vertices(template, points)[1]]
-
-        margin = 0.08
-        mesh = extract_surface(
+        return extract_around(
+            self.body,
+            template,
             field,
-            np.stack([template.min(0) - margin, template.max(0) + margin]),
-            cell=float(wanted.min()),
-            cell_at=cell_at if np.ptp(wanted) > 0 else None,
-            seeds=template,
-            batch_points=batch,
-            max_vertices=max_vertices,
-            edge_steps=edge_steps,
-            project_steps=project_steps,
+            cell,
+            max_vertices,
+            margin=self.config.skinning.grid.band,
+            batch=4096,
         )
-        return mesh.largest_component()
-
-    def _cells_by_vertex(self, sizes: CellSizes) -> np.ndarray:
-        labels = np.asarray(self.body.part_labels)
-        wanted = np.full(len(labels), sizes.body)
-        head = self.body.tree.indices("head")
-        if head:
-            # The whole head, ears and hair too: its shapes are finer than a limb's.
-            on_head = np.asarray(self.body.weights)[:, self.body.tree.subtree(head[0])].sum(1)
-            wanted[(labels == BODY) & (on_head > 0.5)] = sizes.head
-        wanted[np.isin(labels, FACES)] = sizes.face
-        wanted[np.isin(labels, HANDS)] = sizes.hands
-        return wanted
 
 
 _posed = eqx.filter_jit(lambda body, params: pose_body(body, params).vertices)

@@ -104,6 +104,9 @@ def evaluate(
     vertex of the posed body, as in the reference's protocol. See `surface_metrics` for the
     figures. With `learned_from`, the frames of training (`Fit.frames`; only their poses are
     read), figures are also given by how far a pose is from those learned: see `pose_distance`.
+
+    **Raises:** `ValueError` for fewer frames than one, or frames of another tree than the avatar's;
+    `EmptyLevelSetError` if the avatar has no surface.
     """
     chosen = frames[spread(frames, num_frames)]
     distances = None

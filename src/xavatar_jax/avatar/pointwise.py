@@ -14,6 +14,8 @@ from ..correspondence.batched import CHUNK
 from ..kinematics import skin_points
 from ..training import AvatarFields, FitConfig
 
+PROJECT_STEPS, PROJECT_STEP = 3, 0.003  # metres
+
 
 def batch_size(config: FitConfig) -> int:
     """Points a batch: what the geometry field's own memory allows."""
@@ -39,7 +41,7 @@ def gradients(fields: AvatarFields, points: Array, condition: Any) -> Array:
 def project(fields: AvatarFields, points: Array, condition: Any) -> Array:
     """Move places of the neutral surface on to a condition's, from where it carries them.
 
-    By Newton steps along the gradient, 3 mm a step at most.
+    By `PROJECT_STEPS` Newton steps along the gradient, `PROJECT_STEP` at most each.
     """
 
     def value(x: Array) -> Array:
@@ -48,10 +50,10 @@ def project(fields: AvatarFields, points: Array, condition: Any) -> Array:
     def step(_: int, x: Array) -> Array:
         f, g = jax.value_and_grad(value)(x)
         slope = jnp.sqrt(jnp.sum(g**2) + 1e-12)
-        return x - g / slope * jnp.clip(f / slope, -0.003, 0.003)
+        return x - g / slope * jnp.clip(f / slope, -PROJECT_STEP, PROJECT_STEP)
 
     def one(x: Array) -> Array:
-        return jax.lax.fori_loop(0, 3, step, fields.geometry.carry(x, condition))
+        return jax.lax.fori_loop(0, PROJECT_STEPS, step, fields.geometry.carry(x, condition))
 
     return jax.vmap(one)(points)
 

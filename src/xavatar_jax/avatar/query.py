@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..body import BodyModel, BodyParams, bone_transforms
 from ..correspondence import StartSet, implicit_root, search_grid, start_table
 from ..fields import TabulatedSkinning, pose_grid
 from ..training import AvatarFields
+from ..training.objective import best_root
 
 
 class Query(NamedTuple):
@@ -54,12 +54,7 @@ def query_posed(
         fixed_transforms,
         start_table(body.tree, starts, pairs=True),
     )
-    x_c = jax.lax.stop_gradient(roots.x_c)
-    logits = jax.vmap(jax.vmap(lambda x: fields.geometry(x, condition)))(x_c)
-    best = jnp.argmax(jnp.where(roots.valid, logits, -jnp.inf), axis=1)
-    chosen = jnp.take_along_axis(x_c, best[:, None, None], axis=1)[:, 0]
-    found = jnp.any(roots.valid, axis=1)
-    chosen = jnp.where(found[:, None], chosen, 0.0)
+    chosen, found = best_root(fields, jax.lax.stop_gradient(roots.x_c), roots.valid, condition)
 
     def answer(x_c: Array, x_d: Array) -> tuple[Array, Array]:
         polished, _, _ = implicit_root(x_c, x_d, fields.skinning, transforms)

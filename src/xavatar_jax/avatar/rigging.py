@@ -27,7 +27,7 @@ from ..kinematics import TO_Y_UP, KinematicTree
 from .animate import (
     Animation,
     MotionLike,
-    PosableBase,
+    NeutralSurface,
     Spread,
     animate,
     drive_frames,
@@ -166,7 +166,7 @@ def build_rig(
     With `scales` it has two blend shapes a coefficient of expression, one a sign, so that all
     weights lie between 0 and 1: Blender cuts off others on import.
     """
-    base, tree = avatar.posable, avatar.body.tree
+    base, tree = avatar.neutral_surface, avatar.body.tree
     mesh = replace(avatar.canonical_mesh(), vertices=np.asarray(base.vertices).T)
     if colors is not None:
         mesh = replace(mesh, colors=colors)
@@ -186,7 +186,7 @@ def build_rig(
 
 
 def expression_targets(
-    avatar: Avatar, base: PosableBase, scales: Float[np.ndarray, " E"]
+    avatar: Avatar, base: NeutralSurface, scales: Float[np.ndarray, " E"]
 ) -> Float[np.ndarray, "T V 3"]:
     """How each coefficient moves the neutral pose's vertices: all at +1, then all at -1, scaled."""
     count = len(scales)

@@ -25,7 +25,8 @@ from ..training import (
     config_from_dict,
     config_to_dict,
     fresh_fields,
-    trainable_filter,
+    trainable_geometry,
+    trainable_skinning,
 )
 from .avatar import Avatar
 
@@ -37,7 +38,7 @@ def save_avatar(avatar: Avatar, path: str | os.PathLike[str]) -> None:
 
     The body's own arrays, which are licensed, and what is derived from them are left out.
     """
-    arrays = flatten_named(_kept(avatar.fields, avatar))
+    arrays = flatten_named(_kept(avatar.fields))
     source = avatar.body.source
     header = {
         "format": _FORMAT,
@@ -86,17 +87,16 @@ def load_avatar(
     betas = arrays.pop("betas")
     if fields is None:
         fields = fresh_fields(body, config, betas)
-    avatar = Avatar(body, betas, fields, config, header["steps"])
-    kept = unflatten_named(_kept(fields, avatar), arrays, source=os.fspath(path))
+    kept = unflatten_named(_kept(fields), arrays, source=os.fspath(path))
     return Avatar(body, betas, eqx.combine(kept, fields), config, header["steps"])
 
 
-def _kept(fields: AvatarFields, avatar: Avatar) -> AvatarFields:
-    """Leaves that the file holds: all learned ones, whether or not this run has learned them."""
-    kept = trainable_filter(fields, avatar.config)
+def _kept(fields: AvatarFields) -> AvatarFields:
+    """Leaves that the file holds: all that can be learned, whether or not this run did."""
+    geometry = trainable_geometry(fields.geometry)
     if isinstance(fields.geometry, HashGeometry):
-        kept = eqx.tree_at(lambda f: f.geometry.told, kept, replace_fn=lambda _: True)
-    return eqx.filter(fields, kept)
+        geometry = eqx.tree_at(lambda g: g.fixed_leaves, geometry, replace_fn=lambda _: True)
+    return eqx.filter(fields, AvatarFields(trainable_skinning(fields.skinning), geometry))
 
 
 def load_avatar_body(

@@ -38,9 +38,3 @@ class Baseline:
         """Vertices of the whole body in this pose and the person's shape, metres."""
         own = with_betas(params, self.avatar.betas)
         return np.asarray(posed_vertices(self.body, own), np.float64)
-
-
-def check_minutes(minutes: float | None) -> None:
-    """**Raises:** `ValueError` for a budget that is not a positive number of minutes."""
-    if minutes is not None and not (np.isfinite(minutes) and minutes > 0):
-        raise ValueError(f"minutes must be a positive number, found {minutes}")

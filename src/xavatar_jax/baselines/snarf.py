@@ -11,7 +11,7 @@ from ..fields import MLPShape
 from ..frames import Frames, known_body
 from ..sampling import SamplingPlan
 from ..training import FitConfig, paper, quick
-from .baseline import Baseline, check_minutes
+from .baseline import Baseline
 from .skeleton import body_only, body_only_frames
 
 
@@ -74,11 +74,9 @@ def fit_snarf(
     `config` is `snarf_quick()` unless given; fingers, jaw, eyes and expression of the frames'
     parameters are not used. The other arguments are those of `fit`.
 
-    **Raises:** `ValueError` for minutes that are not positive, or a body without a body; else as
-    `fit`.
+    **Raises:** `ValueError` for a body without a body; else as `fit`.
     """
     config = snarf_quick() if config is None else config
-    check_minutes(config.minutes)
     whole = known_body(frames, body)
     cut = body_only(whole)
     done = fit(body_only_frames(cut, frames), config, body=cut, cache=cache, verbose=verbose)

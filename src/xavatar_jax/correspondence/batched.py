@@ -95,7 +95,8 @@ def search_field(
     field a step. With a `guide`, the same field tabulated and posed, the search runs on that to a
     millimetre, and the few distinct places found are moved to the field's own roots by Newton's
     method: the residuals are the field's, at a handful of queries a point. Other arguments are as
-    for `search_grid`; with a guide, starts are not merged.
+    for `search_grid`; with a guide, starts are not merged, and of `solver` and `max_steps` the
+    tolerance alone is used.
     """
     if guide is not None:
         near = search_grid(

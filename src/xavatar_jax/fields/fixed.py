@@ -76,8 +76,8 @@ class FixedHash(AbstractFixedPoints):
         weight, width = self.from_condition, joints.shape[-1]
         h = self.first + _matmul(self.nearness, _matmul(joints, weight[:, :width].T))
         if self.expressive is not None:
-            heard = jnp.einsum("nek,e->nk", self.expressive, expression, precision=_EXACT)
-            h = h + _matmul(heard, weight[:, width:].T)
+            expressed = jnp.einsum("nek,e->nk", self.expressive, expression, precision=_EXACT)
+            h = h + _matmul(expressed, weight[:, width:].T)
         for weight, bias in zip(self.hidden, self.biases, strict=True):
             h = _matmul(softplus(h, self.sharpness), weight.T) + bias
         return h[:, 0]

@@ -36,9 +36,9 @@ class AbstractGeometryField(eqx.Module):
         """Logit at `x_c` (metres, canonical space) under one frame's condition."""
 
     def carry(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, "3"]:
-        """Where a place of the neutral person goes under a condition, if the field was told.
+        """Where a place of the neutral person goes under a condition, if the field knows.
 
-        Its surface is sought from there. A field that was told nothing leaves it where it is.
+        Its surface is sought from there. A field that knows nothing of it leaves it where it is.
         """
         return x_c
 
@@ -49,12 +49,12 @@ class AbstractGeometryField(eqx.Module):
     def within(self, params: BodyParams) -> Self:
         """The field when it is to learn from frames with these parameters, batched.
 
-        A field may keep what range they have, and hear nothing beyond it.
+        A field may keep what range they have, and read nothing beyond it.
         """
         return self
 
-    def audible(self, condition: Any) -> Any:
-        """A condition without what is silent in it: the same logits, sooner.
+    def without_zeros(self, condition: Any) -> Any:
+        """A condition without what is zero in it: the same logits, sooner.
 
         For many points under one known condition; it cannot be traced.
         """
@@ -65,10 +65,12 @@ class MLPGeometry(AbstractGeometryField):
     """The paper's occupancy network, with its global condition (X-Avatar, section 3.1).
 
     The condition is body pose over pi and expression; a hand without a body takes its own pose.
+    Coefficients of expression that are missing are zero; more than `num_expression` are left out.
     """
 
     mlp: ImplicitMLP
     joints: tuple[int, ...] = eqx.field(static=True)
+    num_expression: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -81,25 +83,27 @@ class MLPGeometry(AbstractGeometryField):
         groups = pose_groups(tree)
         hands = groups["left_hand_pose"] + groups["right_hand_pose"]
         self.joints = groups["body_pose"] or hands
+        self.num_expression = num_expression
         width = 3 * len(self.joints) + num_expression
         self.mlp = ImplicitMLP(shape, condition=width, init="ball", key=key)
 
     def condition(self, params: BodyParams) -> Float[Array, " c"]:
         pose = params.pose[np.asarray(self.joints, int)].reshape(-1) / np.pi
-        return jnp.concatenate([pose.astype(params.expression.dtype), params.expression])
+        expression = _first(params.expression, self.num_expression)
+        return jnp.concatenate([pose.astype(expression.dtype), expression])
 
     def __call__(self, x_c: Float[Array, "3"], condition: Float[Array, " c"]) -> Float[Array, ""]:
-        out, _ = self.mlp(x_c, condition)
+        out = self.mlp(x_c, condition)
         return out[0]
 
 
 class LocalCondition(NamedTuple):
-    """One frame as a `HashGeometry` hears it.
+    """What a `HashGeometry` reads of one frame.
 
-    - `joints`: features of each joint's rotation, heard around `centres` (metres) and fading with
+    - `joints`: features of each joint's rotation, which act around `centres` (metres) and fade with
       the squared distance by `fade`.
-    - `expression`: coefficients as they are heard; none of them: silence.
-    - `moves`: coefficients as they move places; none of them: no move.
+    - `expression`: coefficients for what is learned, in the range of `within`; `moves`: those for
+      how places move, as they are. None of them: all are zero.
     """
 
     joints: Float[Array, "J K"]
@@ -114,18 +118,18 @@ class HashGeometry(AbstractGeometryField):
 
     A joint's rotation changes shape near that joint only: its features, linear in the entries of
     the rotation less the identity (as pose blend shapes are), fade with the distance from the
-    joint over half the length of the bones that meet there. Expression reaches the face alone, by
-    an `ExpressionGrid` in its box. Levels finer than the trunk needs are heard inside the boxes
+    joint over half the length of the bones that meet there. Expression acts on the face alone, by
+    an `ExpressionGrid` in its box. Levels finer than the trunk needs are read inside the boxes
     of `detail` alone.
 
     Where the body model's own expression moves places of the face (`moves`), the field is that of
     the place which is moved to the point: a smile carries the corners of a mouth over centimetres,
     further than the features of one place could follow. What is left is learned.
 
-    Entries of rotations and coefficients of expression beyond what `within` was told are heard as
-    the nearest that are not: what noise teaches about a joint that hardly moved would be
-    multiplied by the angle that it turns by later. The body model's own expression is not learned,
-    and moves places by all that it is given.
+    For what is learned, entries of rotations and coefficients of expression are clipped to the
+    range that `within` found in the frames: what noise teaches about a joint that hardly moved
+    would be multiplied by the angle that it turns by later. How the body model's own expression
+    moves places is not learned, and not clipped.
     """
 
     encoding: HashEncoding
@@ -167,12 +171,12 @@ class HashGeometry(AbstractGeometryField):
         self.encoding = HashEncoding(
             low, high, spacing=spacing, features=features, log2_size=log2_size, key=keys[0]
         )
-        heard = 0 if expressive is None else expressive.table.shape[-1]
-        fan_in = (self.encoding.width + condition_width + heard, width, width)
+        expression_width = 0 if expressive is None else expressive.table.shape[-1]
+        fan_in = (self.encoding.width + condition_width + expression_width, width, width)
         fan_out = (width, width, 1)
         self.hidden = _normal_layers(keys[1:], fan_in, fan_out)
         self.biases = tuple(jnp.zeros(m) for m in fan_out)
-        # Silent at first: the start is the same surface in every pose.
+        # Zero at first: the start is the same surface in every pose.
         self.pose_weights = jnp.zeros((tree.num_joints, 9, condition_width))
         self.expressive = expressive
         self.moves = None
@@ -193,8 +197,8 @@ class HashGeometry(AbstractGeometryField):
         pose = _clipped(_turned(params.pose), self.pose_range)
         rows = jnp.einsum("jf,jfk->jk", pose, self.pose_weights)
         given = self._known(params.expression)
-        heard = _clipped(given, self.expression_range)
-        return LocalCondition(rows, *self._around_joints(rows.dtype), heard, given)
+        clipped = _clipped(given, self.expression_range)
+        return LocalCondition(rows, *self._around_joints(rows.dtype), clipped, given)
 
     def within(self, params: BodyParams) -> Self:
         shown = (
@@ -204,13 +208,10 @@ class HashGeometry(AbstractGeometryField):
         return eqx.tree_at(lambda g: (g.pose_range, g.expression_range), self, shown)
 
     def _known(self, expression: Float[Array, " n"]) -> Float[Array, " E"]:
-        # A motion may have fewer coefficients than the person's capture had, or more.
-        count = self.expression_range.shape[1]
-        given = expression[:count]
-        return jnp.pad(given, (0, count - len(given)))
+        return _first(expression, self.expression_range.shape[1])
 
     @property
-    def told(self) -> tuple[Array, ...]:
+    def fixed_leaves(self) -> tuple[Array, ...]:
         """Leaves that are the person's and the frames', and never learned."""
         return self.joints, self.pose_range, self.expression_range
 
@@ -248,13 +249,13 @@ class HashGeometry(AbstractGeometryField):
             sharpness=self.sharpness,
         )
 
-    def audible(self, condition: LocalCondition) -> LocalCondition:
+    def without_zeros(self, condition: LocalCondition) -> LocalCondition:
         # Rows are zero for joints at rest, and coefficients for a neutral face.
-        heard = np.flatnonzero(np.asarray(condition.joints).any(axis=1))
+        used = np.flatnonzero(np.asarray(condition.joints).any(axis=1))
         return LocalCondition(
-            condition.joints[heard],
-            condition.centres[heard],
-            condition.fade[heard],
+            condition.joints[used],
+            condition.centres[used],
+            condition.fade[used],
             _if_any(condition.expression),
             _if_any(condition.moves),
         )
@@ -269,7 +270,7 @@ class HashGeometry(AbstractGeometryField):
         h = jnp.concatenate(h)
         last = len(self.hidden) - 1
         for k, (weight, bias) in enumerate(zip(self.hidden, self.biases, strict=True)):
-            h = weight[:, : len(h)] @ h + bias  # narrower, where expression is silent
+            h = weight[:, : len(h)] @ h + bias  # narrower, where expression is left out
             if k < last:
                 h = softplus(h, self.sharpness)
         return h[0]
@@ -278,12 +279,12 @@ class HashGeometry(AbstractGeometryField):
         return (self.encoding(x) * self._level_mask(x)[:, None]).reshape(-1)
 
     def _around_joints(self, dtype: Any) -> tuple[Float[Array, "J 3"], Float[Array, " J"]]:
-        """Where each joint's condition is heard, and how it fades: see `_nearness`."""
+        """Around where each joint's condition acts, and how it fades: see `_nearness`."""
         fade = jnp.asarray(-0.5 / np.asarray(self.reach) ** 2, dtype)
         return jax.lax.stop_gradient(self.joints).astype(dtype), fade
 
     def _level_mask(self, x: Float[Array, "3"]) -> Float[Array, " levels"]:
-        """1 for levels heard at `x`, falling to 0 over the last two centimetres of a box."""
+        """1 for levels read at `x`, falling to 0 over the last two centimetres of a box."""
         spacing = np.asarray(self.encoding.spacing)
         mask = jnp.asarray(spacing >= self.trunk_spacing * 0.999, x.dtype)
         for low, high, finest in zip(
@@ -293,6 +294,12 @@ class HashGeometry(AbstractGeometryField):
             inside = jnp.clip(depth / 0.02, 0, 1)
             mask = jnp.maximum(mask, inside * jnp.asarray(spacing >= finest * 0.999, x.dtype))
         return mask
+
+
+def _first(expression: Float[Array, " n"], count: int) -> Float[Array, " count"]:
+    """So many coefficients: a motion may have fewer than the person's capture had, or more."""
+    given = expression[:count]
+    return jnp.pad(given, (0, count - len(given)))
 
 
 def _if_any(coefficients: Float[Array, " E"]) -> Float[Array, " _"]:
@@ -310,7 +317,7 @@ def _everything(*shape: int) -> Float[Array, "2 *shape"]:
 
 
 def _range(values: Float[Array, "F *shape"]) -> Float[Array, "2 *shape"]:
-    """Least and most of each entry; silence, which fields know from the start, is among them."""
+    """Least and most of each entry; zero, which fields know from the start, is among them."""
     found = jnp.stack([jnp.minimum(values.min(0), 0), jnp.maximum(values.max(0), 0)])
     return found.astype(jnp.float32)
 
@@ -325,7 +332,7 @@ def _clipped(
 def _nearness(
     x: Float[Array, "3"], centres: Float[Array, "J 3"], fade: Float[Array, " J"]
 ) -> Float[Array, " J"]:
-    """How much of each joint's condition is heard at `x`: a Gaussian of the distance."""
+    """How much of each joint's condition acts at `x`: a Gaussian of the distance."""
     # By axis: compiled for a CPU, a sum over three is a loop for each joint.
     u, v, w = x[:, None] - centres.astype(x.dtype).T
     return jnp.exp((u * u + v * v + w * w) * fade.astype(x.dtype))

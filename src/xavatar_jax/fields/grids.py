@@ -1,10 +1,11 @@
 """Part grids: nodes near the body, coarse for the trunk, fine for hands and face.
 
 One coarse grid covers everything; each fine grid is a box aligned with coarse cells, so that a
-point is looked up in exactly one grid. At a fine box's border the values are those of the coarse
-grid's own interpolation, reached over a margin: the interpolated field is continuous everywhere.
-Cells near the body store their nodes; elsewhere a cell answers with the nearest stored one and
-`covers` is false.
+point is looked up in exactly one grid. Cells near the body store their nodes. In a fine box,
+further from hands and face than its own band (hair, hats, sleeves), the coarse grid answers. Where
+a fine grid ends the values are those of the coarse grid's own interpolation, reached over a margin:
+the interpolated field is continuous. Beyond the coarse grid's band a cell answers with the nearest
+stored one, and `covers` is false.
 """
 
 from __future__ import annotations
@@ -23,7 +24,11 @@ CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], 
 
 @dataclass(frozen=True)
 class GridSpacing:
-    """Node distances and band widths in metres; margins in cells of the coarse grid."""
+    """Node distances and band widths in metres; margins in cells of the coarse grid.
+
+    A fine grid passes into the coarse one over `margin` at its box's sides, over `fine_margin`
+    where its band ends inside.
+    """
 
     body: float = 0.016
     hands: float = 0.004
@@ -31,13 +36,14 @@ class GridSpacing:
     band: float = 0.08
     fine_band: float = 0.03
     margin: float = 1.5
+    fine_margin: float = 0.5
 
 
 class PartGrids(eqx.Module):
     """Where the nodes are. Values live outside, one row a node.
 
-    Grid 0 is the coarse one. All grids share one array of nodes and one of cells; a cell lists
-    its eight nodes.
+    Grid 0 is the coarse one. All grids share one array of nodes and one of cells, of which the
+    first `coarse_cells` are of grid 0; a cell lists its eight nodes.
     """
 
     nodes: Float[Array, "N 3"]
@@ -52,6 +58,7 @@ class PartGrids(eqx.Module):
     blend_cells: Int[Array, "B 8"]
     blend_lerp: Float[Array, "B 8"]
     blend_share: Float[Array, " B"]
+    coarse_cells: int = eqx.field(static=True)
 
     @property
     def num_nodes(self) -> int:
@@ -68,10 +75,16 @@ class PartGrids(eqx.Module):
         spacing = self.spacing[grid].astype(x.dtype)
         u = (x - self.origin[grid].astype(x.dtype)) / spacing[..., None]
         shape = self.shape[grid]
-        cell = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
-        flat = (cell[..., 0] * shape[..., 1] + cell[..., 1]) * shape[..., 2] + cell[..., 2]
-        fraction = jnp.clip(u - cell, 0, 1)
-        return self.index[self.offset[grid] + flat], fraction, spacing
+        ijk = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
+        fraction = jnp.clip(u - ijk, 0, 1)
+        flat = (ijk[..., 0] * shape[..., 1] + ijk[..., 1]) * shape[..., 2] + ijk[..., 2]
+        cell = self.index[self.offset[grid] + flat]
+        # Where a fine box leaves the answer to the coarse grid, the place is that in its cell.
+        coarse = cell < self.coarse_cells
+        ratio = jnp.round(self.spacing[0] / self.spacing).astype(jnp.int32)[grid][..., None]
+        place = (ijk % ratio + fraction) / ratio
+        fraction = jnp.where(coarse[..., None], place, fraction)
+        return cell, fraction, jnp.where(coarse, self.spacing[0].astype(x.dtype), spacing)
 
     def covers(self, x: Float[Array, "*p 3"]) -> Bool[Array, "*p"]:
         """Whether points lie in cells that store their nodes."""
@@ -87,16 +100,6 @@ class PartGrids(eqx.Module):
         cell, fraction, _ = self.locate(x)
         return (lerp_weights(fraction)[..., None] * values[self.cells[cell]]).sum(-2)
 
-    def interpolate_with_gradient(
-        self, values: Float[Array, "N K"], x: Float[Array, "*p 3"]
-    ) -> tuple[Float[Array, "*p K"], Float[Array, "*p K 3"]]:
-        """Interpolated values and their exact derivative inside the cell, per metre."""
-        cell, fraction, spacing = self.locate(x)
-        corner = values[self.cells[cell]]
-        value = (lerp_weights(fraction)[..., None] * corner).sum(-2)
-        slopes = lerp_slopes(fraction) / spacing[..., None, None]  # (..., 8, 3)
-        return value, (slopes[..., None, :] * corner[..., None]).sum(-3)
-
     def blend(self, values: Float[Array, "N K"]) -> Float[Array, "N K"]:
         """Make values continuous across grids: fine nodes near a border follow the coarse grid."""
         coarse = (self.blend_lerp[..., None] * values[self.blend_cells]).sum(1)
@@ -109,19 +112,6 @@ def lerp_weights(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8"]:
     """Weights of a cell's eight nodes at a position in it."""
     f = fraction[..., None, :]
     return jnp.where(CORNERS == 1, f, 1 - f).prod(-1)
-
-
-def lerp_slopes(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8 3"]:
-    """Derivatives of `lerp_weights` with respect to the position in the cell."""
-    f = fraction[..., None, :]
-    factor = jnp.where(CORNERS == 1, f, 1 - f)
-    sign = jnp.asarray(np.where(CORNERS == 1, 1.0, -1.0), fraction.dtype)
-    yz, xz, xy = (
-        factor[..., 1] * factor[..., 2],
-        factor[..., 0] * factor[..., 2],
-        factor[..., 0] * factor[..., 1],
-    )
-    return jnp.stack([sign[:, 0] * yz, sign[:, 1] * xz, sign[:, 2] * xy], axis=-1)
 
 
 def build_part_grids(
@@ -161,7 +151,7 @@ def build_part_grids(
                 low + first * coarse,
                 ((last - first) * ratio).astype(int),
                 coarse / ratio,
-                max(reach, spacing.fine_band),
+                reach,
                 near,
             )
         )
@@ -171,9 +161,11 @@ def build_part_grids(
 def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
     from scipy.ndimage import distance_transform_edt
 
-    nodes, cells, covered, index, offsets = [], [], [], [], []
-    node_count = cell_count = dense_count = 0
-    for origin, shape, step, band, points in boxes:
+    nodes, cells, covered, index, offsets, depths = [], [], [], [], [], []
+    node_count = cell_count = dense_count = coarse_cells = 0
+    coarse_low, _, coarse_step, _, _ = boxes[0]
+    coarse_index = np.zeros(0, int)
+    for g, (origin, shape, step, band, points) in enumerate(boxes):
         near = _cells_near(origin, shape, step, band, points)
         flat = np.flatnonzero(near.ravel())
         ijk = np.stack(np.unravel_index(flat, near.shape), 1)
@@ -182,25 +174,34 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         unique, inverse = np.unique(corner @ stride, return_inverse=True)
         position = np.stack(np.unravel_index(unique, tuple(shape + 1)), 1)
         nodes.append(origin + position * step)
+        depths.append(step * _nodes_to_edge(near)[tuple(position.T)])
         cells.append(inverse.reshape(-1, 8) + node_count)
-        # A cell without nodes answers with the nearest cell that has some.
+        covered.append(np.ones(len(flat), bool))
         order = np.full(near.shape, -1)
-        order.ravel()[flat] = np.arange(len(flat))
-        nearest: Any = distance_transform_edt(~near, return_distances=False, return_indices=True)
-        dense = order[tuple(nearest)].ravel() + cell_count
-        covered_here = np.ones(len(flat), bool)
-        # Those stand-ins are doubled, so that a cell knows whether it was asked for itself.
-        dense = np.where(near.ravel(), dense, dense + len(flat))
-        cells.append(cells[-1])
-        covered += [covered_here, ~covered_here]
-        index.append(dense)
+        order.ravel()[flat] = np.arange(len(flat)) + cell_count
+        if g == 0:
+            # A cell without nodes answers with the nearest cell that has some. Those stand-ins are
+            # doubled, so that a cell knows whether it was asked for itself.
+            nearest: Any = distance_transform_edt(
+                ~near, return_distances=False, return_indices=True
+            )
+            dense = coarse_index = np.where(near, order, order[tuple(nearest)] + len(flat))
+            cells.append(cells[-1])
+            covered.append(~covered[-1])
+            coarse_cells = 2 * len(flat)
+        else:
+            first = np.rint((origin - coarse_low) / coarse_step).astype(int)
+            ratio = int(np.rint(coarse_step / step))
+            under = [first[k] + np.arange(shape[k]) // ratio for k in range(3)]
+            dense = np.where(near, order, coarse_index[np.ix_(*under)])
+        index.append(dense.ravel())
         offsets.append(dense_count)
         node_count += len(unique)
-        cell_count += 2 * len(flat)
+        cell_count += (2 if g == 0 else 1) * len(flat)
         dense_count += near.size
     all_nodes, all_cells = np.concatenate(nodes), np.concatenate(cells)
     all_index = np.concatenate(index)
-    margins = _margins(nodes, boxes, all_cells, all_index, spacing)
+    margins = _margins(nodes, depths, boxes, all_cells, all_index, spacing)
     return PartGrids(
         nodes=jnp.asarray(all_nodes, jnp.float32),
         cells=jnp.asarray(all_cells, jnp.int32),
@@ -214,6 +215,7 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         blend_cells=jnp.asarray(margins.cells, jnp.int32),
         blend_lerp=margins.lerp,
         blend_share=jnp.asarray(margins.share, jnp.float32),
+        coarse_cells=coarse_cells,
     )
 
 
@@ -233,8 +235,25 @@ def _cells_near(
     return away * step <= band + step
 
 
+def _nodes_to_edge(near: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "X Y Z"]:
+    """Of every node, how many nodes away the nearest one is that has a cell without nodes.
+
+    What is outside the box does not count.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    padded = np.pad(near, 1, constant_values=True)
+    x, y, z = (n + 1 for n in near.shape)
+    whole = np.ones((x, y, z), bool)
+    for i, j, k in CORNERS:
+        whole &= padded[i : i + x, j : j + y, k : k + z]
+    if whole.all():
+        return np.full(whole.shape, np.inf)
+    return np.asarray(distance_transform_edt(whole))
+
+
 class _Margins(NamedTuple):
-    """Fine nodes near their box's border, their coarse cell and place in it, and its share."""
+    """Fine nodes near where their grid ends, their coarse cell and place in it, and its share."""
 
     nodes: Int[np.ndarray, " B"]
     cells: Int[np.ndarray, "B 8"]
@@ -244,6 +263,7 @@ class _Margins(NamedTuple):
 
 def _margins(
     nodes: list[Float[np.ndarray, "n 3"]],
+    depths: list[Float[np.ndarray, " n"]],
     boxes: list,
     cells: Int[np.ndarray, "C 8"],
     index: Int[np.ndarray, " dense"],
@@ -255,7 +275,10 @@ def _margins(
         origin, shape, step, _, _ = boxes[g]
         local = nodes[g] - origin
         depth = np.minimum(local, shape * step - local).min(1)
-        t = np.clip(depth / (spacing.margin * spacing.body), 0, 1)
+        t = np.minimum(
+            np.clip(depth / (spacing.margin * spacing.body), 0, 1),
+            np.clip(depths[g] / (spacing.fine_margin * spacing.body), 0, 1),
+        )
         share = 1 - t * t * (3 - 2 * t)
         rows = np.flatnonzero(share > 0)
         picked.append(rows + first[g])

@@ -112,14 +112,14 @@ class ImplicitMLP(eqx.Module):
 
     def __call__(
         self, x: Float[Array, " n"], condition: Float[Array, " c"] | None = None
-    ) -> tuple[Float[Array, " out"], Float[Array, " width"]]:
-        """The outputs for one point, and the last hidden activation (the colour field reads it)."""
+    ) -> Float[Array, " out"]:
+        """The outputs for one point."""
         encoded = positional_encoding(x, self.shape.octaves)
         if self.embedding is not None:
             assert condition is not None
             assert self.embedding_bias is not None
             condition = self.embedding @ condition + self.embedding_bias
-        h = hidden = encoded
+        h = encoded
         for k, layer in enumerate(self.layers):
             if k in self.shape.condition_at and condition is not None:
                 h = jnp.concatenate([h, condition])
@@ -127,8 +127,8 @@ class ImplicitMLP(eqx.Module):
                 h = jnp.concatenate([h, encoded]) / np.sqrt(2).astype(x.dtype)
             h = layer(h)
             if k < self.shape.depth:
-                h = hidden = sharp_softplus(h)
-        return h, hidden
+                h = sharp_softplus(h)
+        return h
 
 
 def _ball_layer(

@@ -50,7 +50,7 @@ class MLPSkinning(AbstractSkinningField):
         self.soft_blend = soft_blend
 
     def __call__(self, x_c: Float[Array, "3"]) -> Float[Array, " J"]:
-        logits, _ = self.mlp(x_c)
+        logits = self.mlp(x_c)
         return hierarchical_softmax(self.tree, self.soft_blend * logits)
 
     def covers(self, x_c: Float[Array, "3"]) -> Array:

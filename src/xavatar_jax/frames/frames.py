@@ -222,7 +222,7 @@ class Frames(Sequence[Frame]):
                 f"{len(vertices)} vertices; expected ({len(vertices)},)."
             )
         params = _take(self._params, position)
-        # Inside and outside are told by winding numbers, which need triangles that face outwards.
+        # Winding numbers decide what is inside, which need triangles that face outwards.
         turned = enclosed_volume(vertices, faces) < 0
         faces = faces[:, ::-1] if turned else faces
         return Frame(vertices, faces, params, labels, shared.names[i], turned)

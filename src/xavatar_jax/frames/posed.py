@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int8
 
 from ..body import BodyModel, BodyParams, pose_body
+from ..geometry import nearest_vertices
 from .frames import Frames
 
 
@@ -68,7 +69,5 @@ def nearest_part_labels(
         params: unbatched parameters of the mesh.
         vertices: metres, in the world of `params`.
     """
-    from scipy.spatial import cKDTree
-
-    _, nearest = cKDTree(posed_vertices(body, params)).query(vertices)
+    _, nearest = nearest_vertices(posed_vertices(body, params), vertices)
     return np.asarray(body.part_labels, np.int8)[nearest]

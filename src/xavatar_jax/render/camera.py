@@ -119,11 +119,7 @@ def frame_view(
     """
     if view not in _VIEWS:
         raise ValueError(f"no view {view!r}: choose one of {', '.join(_VIEWS)}.")
-    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    ahead = np.asarray(forward, dtype=np.float64)
-    ahead = ahead - (ahead @ vertical) * vertical
-    ahead /= np.linalg.norm(ahead)
-    left = np.cross(vertical, ahead)
+    vertical, ahead, left = _ground_axes(up, forward)
     angle = math.radians(_VIEWS[view])
     level = math.cos(angle) * ahead + math.sin(angle) * left
     direction = math.cos(elevation) * level + math.sin(elevation) * vertical
@@ -186,11 +182,7 @@ def orbit_views(
         ValueError: if there are no points.
     """
     checked = check_points(points)
-    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    ahead = np.asarray(forward, dtype=np.float64)
-    ahead = ahead - (ahead @ vertical) * vertical
-    ahead /= np.linalg.norm(ahead)
-    left = np.cross(vertical, ahead)
+    vertical, ahead, left = _ground_axes(up, forward)
     ways = [
         math.cos(elevation) * (math.cos(turn) * ahead + math.sin(turn) * left)
         + math.sin(elevation) * vertical
@@ -203,8 +195,22 @@ def orbit_views(
     distance = 1e-3
     for way in ways:
         seen = (checked - middle) @ Camera.look_at(middle + way, middle, up=up).rotation.T
-        distance = max(distance, float((np.abs(seen[:, :2]) / slopes - seen[:, 2:]).max()))
+        distance = max(distance, _distance(seen, slopes))
     return [Camera.look_at(middle + distance * way, middle, up=up, fov=fov) for way in ways]
+
+
+def _ground_axes(up: Vector, forward: Vector) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors up, forward in the plane of the ground, and to the person's left."""
+    vertical = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    ahead = np.asarray(forward, dtype=np.float64)
+    ahead = ahead - (ahead @ vertical) * vertical
+    ahead /= np.linalg.norm(ahead)
+    return vertical, ahead, np.cross(vertical, ahead)
+
+
+def _distance(seen: Float[np.ndarray, "N 3"], slopes: Float[np.ndarray, "2"]) -> float:
+    """How far from the middle a camera has to be for all of what it sees to be in the picture."""
+    return float((np.abs(seen[:, :2]) / slopes - seen[:, 2:]).max())
 
 
 def _fit(
@@ -223,11 +229,11 @@ def _fit(
     for _ in range(3):
         camera = Camera.look_at(middle + direction, middle, up=up, fov=fov)
         seen = (points - middle) @ camera.rotation.T
-        distance = float((np.abs(seen[:, :2]) / slopes - seen[:, 2:]).max())
+        distance = _distance(seen, slopes)
         # Centre what is seen rather than the box: perspective shifts it.
         plane = seen[:, :2] / np.maximum(seen[:, 2:] + distance, 1e-9)
         shift = 0.5 * (plane.min(axis=0) + plane.max(axis=0)) * distance
         middle = middle + shift @ camera.rotation[:2]
     seen = (points - middle) @ camera.rotation.T
-    distance = float((np.abs(seen[:, :2]) / slopes - seen[:, 2:]).max())
+    distance = _distance(seen, slopes)
     return Camera.look_at(middle + max(distance, 1e-3) * direction, middle, up=up, fov=fov)

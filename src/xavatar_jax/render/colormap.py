@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
-from .sheet import draw_text
+from .sheet import BACKGROUND, draw_text
 
 # From calm blue by yellow to red, with lightness rising to the middle and saturation to the end.
 _TABLE = np.array(
@@ -44,7 +44,7 @@ def color_bar(
     max_mm: float,
     size: tuple[int, int] = (70, 512),
     *,
-    background: tuple[float, float, float] = (0.965, 0.965, 0.97),
+    background: tuple[float, float, float] = BACKGROUND,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A vertical bar of the error colours with its scale in mm; `size` is width and height.
 

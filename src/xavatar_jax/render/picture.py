@@ -10,6 +10,7 @@ from .camera import Camera
 from .ground import ground_shadow
 from .light import shade, to_linear, to_srgb
 from .rays import Hits
+from .sheet import BACKGROUND
 from .subject import Points, Subject
 
 SHADINGS = ("color", "error", "normal", "flat")
@@ -18,7 +19,6 @@ SKIN_COLOR = (0.80, 0.66, 0.57)
 """Of an avatar without colours of its own, sRGB."""
 TRUTH_COLOR = (0.72, 0.74, 0.78)
 """Of ground truth beside it, sRGB."""
-BACKGROUND = (0.965, 0.965, 0.97)
 # Neighbouring pixels that differ by more than this get more rays: normals, linear albedo, and
 # depth as a part of the mesh's extent.
 _EDGES = (0.35, 0.03, 0.015)

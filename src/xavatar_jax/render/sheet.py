@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import UInt8
 
+BACKGROUND = (0.965, 0.965, 0.97)
+"""Of pictures and sheets, sRGB."""
 _TEXT_COLOR = (60, 62, 68)
 
 
@@ -39,7 +41,7 @@ def grid_picture(
     title: str = "",
     gap: int = 6,
     text_size: int = 16,
-    background: tuple[float, float, float] = (0.965, 0.965, 0.97),
+    background: tuple[float, float, float] = BACKGROUND,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Lay pictures out in rows, with labels over the columns and before the rows.
 

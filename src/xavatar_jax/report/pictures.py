@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..avatar import Animation, Avatar
+from ..avatar.animate import spread_frames
 from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyParams, facing
 from ..frames import Frame, Frames
 from ..geometry import closest_points
@@ -71,7 +72,7 @@ def animation(
     avatar: Avatar, frames: Frames, *, size: int = 360, count: int = 36
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """The avatar beside the truth, `count` frames of one sequence from a fixed camera."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int))
+    chosen = spread_frames(len(frames), count)
     params = frames[chosen].params
     camera = frame_view(_reach(avatar, params), "front", forward=tuple(facing(params[0])))
     pictures = []
@@ -118,5 +119,5 @@ def motion_pictures(
 
 def _reach(avatar: Avatar, params: BodyParams, count: int = 8) -> Float[np.ndarray, "N 3"]:
     """Vertices of the body in frames spread over a motion, which a camera has to show."""
-    chosen = np.unique(np.linspace(0, len(params) - 1, min(count, len(params))).astype(int))
+    chosen = spread_frames(len(params), count)
     return np.concatenate([avatar.posed_template(params[int(k)]) for k in chosen])

@@ -23,9 +23,10 @@ from .loop import choose_frames as choose_frames
 from .loop import fit_fields as fit_fields
 from .loop import subject_betas as subject_betas
 from .model import AvatarFields as AvatarFields
-from .model import as_dtype as as_dtype
 from .model import fresh_fields as fresh_fields
 from .model import trainable_filter as trainable_filter
+from .model import trainable_geometry as trainable_geometry
+from .model import trainable_skinning as trainable_skinning
 from .objective import ExtraTerms as ExtraTerms
 from .objective import Term as Term
 from .prefit import initial_fields as initial_fields

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from dataclasses import dataclass, replace
@@ -29,6 +30,12 @@ class Budget(Protocol):
     def train_frames(self) -> int: ...
     @property
     def frames_per_minute(self) -> int: ...
+
+
+def check_minutes(minutes: float | None) -> None:
+    """**Raises:** `ValueError` for a budget that is not a positive number of minutes."""
+    if minutes is not None and not (math.isfinite(minutes) and minutes > 0):
+        raise ValueError(f"minutes must be a positive number, found {minutes}")
 
 
 def frames_in_budget(config: Budget) -> int:

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Int
 
 from ..body import BodyModel
-from ..frames import Frame, posed_vertices
+from ..frames import Frame, Frames, posed_vertices
 from ..geometry import nearest_vertices
 
 MISFIT_M = 0.03
 _LOOKED_AT = 500  # vertices of the body that are compared with a mesh: enough for a median
 _NAMED = 8
+_FEW_FOUND = 0.9
 
 
 class TrainingNotice(UserWarning):
@@ -22,9 +24,9 @@ class TrainingNotice(UserWarning):
 
 
 def notify(message: str, record: list[str] | None, *, stacklevel: int) -> None:
-    """Warn (`TrainingNotice`), and add the message to the run's record, if there is one."""
+    """Warn (`TrainingNotice`), and add the message to the run's record, once, if there is one."""
     warnings.warn(message, TrainingNotice, stacklevel=stacklevel + 1)
-    if record is not None:
+    if record is not None and message not in record:
         record.append(message)
 
 
@@ -74,6 +76,38 @@ def misfit(body: BodyModel, frame: Frame) -> float:
     chosen = posed[:: max(len(posed) // _LOOKED_AT, 1)]
     distance, _ = nearest_vertices(frame.vertices, chosen)
     return float(np.median(distance))
+
+
+def check_found(
+    frames: Frames, found: Int[np.ndarray, " F"], points: int, record: list[str] | None
+) -> None:
+    """Look at how many of each frame's points have a root.
+
+    **Raises:** `ValueError` if none of any frame has one.
+    **Warns:** `TrainingNotice` naming frames without any, or if many points of all have none.
+    """
+    lost = [source for source, count in zip(frames.sources, found, strict=True) if not count]
+    if len(lost) == len(found):
+        raise ValueError(
+            f"no point of any frame was found on the body: {_listed(lost)}. Meshes and parameters "
+            "do not belong together; check units (metres), axes and transl."
+        )
+    if lost:
+        notify(
+            f"{len(lost)} of {len(found)} frames have no point that was found on the body, and "
+            f"nothing is learned from them: {_listed(lost)}.",
+            record,
+            stacklevel=4,
+        )
+    share = found.sum() / (points * (len(found) - len(lost)))
+    if share < _FEW_FOUND:
+        notify(
+            f"{1 - share:.0%} of the points were not found on the body, and nothing is learned "
+            "there: clothes or hair may reach further from the skin than skinning weights are "
+            "known.",
+            record,
+            stacklevel=4,
+        )
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -19,6 +19,7 @@ from ..body import BodyModel, BodyParams
 from ..files import flatten_named, load_arrays, refuse_newer, save_arrays, unflatten_named
 from .check import notify
 from .config import FitConfig, config_from_dict, config_to_dict
+from .devices import Devices
 from .history import History
 from .pool import FramePool
 from .step import TrainState
@@ -43,19 +44,25 @@ class RunIdentity:
     """What a run is made of. A checkpoint of another one is refused.
 
     - `body`: checksum; `data`: checksum of the frames' parameters and the person's betas.
+    - `versions`: of packages, and the devices. They may differ, and numbers with them.
     """
 
     body: str
     data: str
     config: dict[str, Any]
+    versions: dict[str, Any]
 
 
-def run_identity(body: BodyModel, params: BodyParams, betas: Any, config: FitConfig) -> RunIdentity:
+def run_identity(
+    body: BodyModel, params: BodyParams, betas: Any, config: FitConfig, devices: Devices
+) -> RunIdentity:
     """The identity of a run on frames with these parameters."""
     digest = hashlib.sha256()
     for values in (params.pose, params.expression, params.transl, betas):
         digest.update(np.ascontiguousarray(values).tobytes())
-    return RunIdentity(body.source.checksum, digest.hexdigest(), config_to_dict(config))
+    return RunIdentity(
+        body.source.checksum, digest.hexdigest(), config_to_dict(config), _versions(devices)
+    )
 
 
 def save_checkpoint(
@@ -81,7 +88,7 @@ def save_checkpoint(
         "best": best.to_dict(),
         "history": history.to_dict(),
         "latest": dict(latest),
-        "versions": _versions(),
+        "versions": identity.versions,
     }
     save_arrays(path, arrays, header)
 
@@ -172,11 +179,10 @@ def load_checkpoint(
             f"{name}: a checkpoint of a run with another config: {', '.join(changed)}. Only "
             f"{', '.join(_FREE)} may change when a run goes on"
         )
-    versions = _versions()
     other = [
-        f"{what} {old} (now {versions.get(what)})"
+        f"{what} {old} (now {identity.versions.get(what)})"
         for what, old in header["versions"].items()
-        if versions.get(what) != old
+        if identity.versions.get(what) != old
     ]
     if other:
         notify(
@@ -238,12 +244,12 @@ def _pool_arrays(pool: FramePool) -> dict[str, Any]:
     }
 
 
-def _versions() -> dict[str, Any]:
-    device = jax.devices()[0]
+def _versions(devices: Devices) -> dict[str, Any]:
+    device = devices.first
     return {
         "xavatar_jax": __version__,
         "jax": jax.__version__,
         "numpy": np.__version__,
         "device": f"{device.platform}: {device.device_kind}",
-        "devices": jax.device_count(),
+        "devices": devices.count,
     }

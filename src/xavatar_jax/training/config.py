@@ -32,8 +32,8 @@ class SkinningConfig:
 class GeometryConfig:
     """`hash`: feature grids and a small MLP; `mlp`: the paper's network.
 
-    `spacing` is the node distance of each level in metres; levels finer than `trunk` are heard
-    at hands (down to `hands`) and face (down to `face`) only. Expression is heard at the face, by
+    `spacing` is the node distance of each level in metres; levels finer than `trunk` are read
+    at hands (down to `hands`) and face (down to `face`) only. Expression acts at the face, by
     `expression_features` on a grid of `expression_spacing`; nodes `expression_moves` apart know
     how the body model's own expression moves the face, and the field follows (0: it does not).
     """
@@ -97,7 +97,9 @@ class LossConfig:
 class OptimiserConfig:
     """Adam with a global-norm clip; `cosine` falls to a hundredth of the rate at the last step.
 
-    `warmup`: steps over which the rates rise to what they are.
+    - `learning_rate`: of the geometry field, and of either field in the fits before training;
+      `skinning_rate`: of the skinning field in training.
+    - `warmup`: steps over which the rates rise to what they are.
     """
 
     learning_rate: float = 1e-3

@@ -19,7 +19,7 @@ from .config import FitConfig
 
 _BY_FRAME, _BY_POINT = PartitionSpec("frames"), PartitionSpec("frames", "points")
 _WHOLE = PartitionSpec()
-_POINT_LEAVES = ("points", "parts", "distance", "root")
+_POINT_LEAVES = ("points", "parts", "distance", "root", "rooted")
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,10 @@ class Devices:
         return int(np.min(_of_every_process(number)))
 
     @property
+    def first(self) -> Any:
+        return jax.devices()[0] if self.mesh is None else self.mesh.devices.flat[0]
+
+    @property
     def count(self) -> int:
         return 1 if self.mesh is None else self.mesh.size
 
@@ -126,7 +130,7 @@ def share_work(config: FitConfig, devices: Sequence[Any] | None = None) -> Devic
     **Raises:** `ValueError` if the batch cannot be divided evenly.
     """
     chosen = list(jax.devices() if devices is None else devices)
-    if len(chosen) == 1:
+    if chosen == jax.devices()[:1]:
         return ONE_DEVICE
     rows = gcd(config.frames_per_step, len(chosen))
     columns = len(chosen) // rows

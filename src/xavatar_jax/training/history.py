@@ -14,7 +14,7 @@ class History:
 
     - `steps`, `terms`: steps at which terms were recorded, and each term there.
     - `validated`, `validation`: steps at which validation frames were asked, and their loss.
-    - `seconds`: by stage, over all calls where a run was resumed.
+    - `seconds`: by stage, over all calls where a run was resumed; `total` is of the last call.
     - `steps_done`; `best_step`: the step whose fields are kept; `stopped`: "steps", "minutes",
       "plateau", "interrupt" or "not finite".
     - `frames`: how many were learned from; `planned`: steps that the minutes were found to hold,

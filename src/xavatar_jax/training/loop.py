@@ -12,11 +12,11 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from ..body import BodyModel, check_params
+from ..body import BodyModel, check_params, with_betas
 from ..frames import Frames
 from ..sampling import varied_frames
-from .budget import as_begun, frames_in_budget, say_fewer_frames
-from .check import notify
+from .budget import as_begun, check_minutes, frames_in_budget, say_fewer_frames
+from .check import check_found, notify
 from .checkpoint import Keeper, load_checkpoint, run_identity
 from .config import FitConfig, check_start
 from .devices import ONE_DEVICE, Devices, share_work
@@ -31,6 +31,8 @@ from .redraw import Redraw
 from .run import Callback, Fitted, Run
 from .settle import settle_on_person
 from .validation import split_validation
+
+_SAME_BETAS = 1e-3  # what a file rounds
 
 
 def fit_fields(
@@ -61,16 +63,18 @@ def fit_fields(
     """
     started = time.perf_counter()
     check_start(config)
+    check_minutes(config.minutes)
     deadline = None if config.minutes is None else started + 60 * config.minutes
     check_params(body, frames.params, what="frames.params")
     check_terms(terms or {})
     sharing = share_work(config, devices)
     begun = as_begun(config, checkpoint) if resume and checkpoint is not None else config
     keeper, notices = None, []
+    frames = _of_one_shape(frames, betas, notices)
     learned, held = choose_frames(frames, begun, notices)
     chosen = frames[np.concatenate([learned, held])]
     if checkpoint is not None:
-        identity = run_identity(body, chosen.params, betas, config)
+        identity = run_identity(body, chosen.params, betas, config, sharing)
         goes_on = _goes_on(checkpoint, resume, notices)
         saved = load_checkpoint(checkpoint, identity, notices) if goes_on else None
         keeper = Keeper(Path(checkpoint), identity, saved)
@@ -79,33 +83,26 @@ def fit_fields(
     history = History(frames=len(learned))
     if keeper is not None and keeper.saved is not None:
         history = keeper.saved.history()
-    history.notices += notices
+    history.notices += [said for said in notices if said not in history.notices]
     lines = None
     if log is not None and jax.process_index() == 0:
         lines = JsonLines(log, after=None if not history.steps_done else history.steps_done)
 
     if fields is None:
         initial = initial_fields(body, config, cache=cache, verbose=verbose)
-        clock = history.lap("prefit", started)
-        start = settle_on_person(body, initial, betas, config, verbose=verbose)
     else:
-        initial = start = fields
-        clock = history.lap("prefit", started)
-    geometry = start.geometry.within(frames[learned].params)
-    start = AvatarFields(start.skinning, geometry)
-    clock = history.lap("settle", clock)
+        initial = fields
+    clock = history.lap("prefit", started)
+    start = initial
+    if fields is None:
+        start = settle_on_person(body, initial, betas, config, verbose=verbose)
+    start = AvatarFields(start.skinning, start.geometry.within(frames[learned].params))
+    history.lap("settle", clock)
     pool = None
     if keeper is not None and keeper.saved is not None:
         pool = keeper.saved.pool(centred(chosen.params))
     if pool is None:
-        with progress("points", len(chosen), verbose=verbose, unit="frame") as bar:
-            pool = label_frames(body, chosen, config, bar=bar, notices=history.notices)
-        clock = history.lap("labels", clock)
-        if config.search.cached:
-            with progress("roots", len(chosen), verbose=verbose, unit="frame") as bar:
-                pool = find_roots(body, betas, start.skinning, pool, config, bar=bar)
-            history.found = float(pool.found.mean() / pool.points.shape[1])
-            history.lap("roots", clock)
+        pool = _labelled_pool(body, chosen, betas, start, config, history, verbose=verbose)
     redraw = None
     if config.redraw_every:
         redraw = Redraw(body, frames[learned], betas, config, start.skinning)
@@ -135,6 +132,30 @@ def fit_fields(
         history.lap("total", started)
 
 
+def _labelled_pool(
+    body: BodyModel,
+    frames: Frames,
+    betas: Any,
+    start: AvatarFields,
+    config: FitConfig,
+    history: History,
+    *,
+    verbose: bool,
+) -> FramePool:
+    """Points of the frames and, if they are stored, their roots."""
+    clock = time.perf_counter()
+    with progress("points", len(frames), verbose=verbose, unit="frame") as bar:
+        pool = label_frames(body, frames, config, bar=bar, notices=history.notices)
+    clock = history.lap("labels", clock)
+    if config.search.cached:
+        with progress("roots", len(frames), verbose=verbose, unit="frame") as bar:
+            pool = find_roots(body, betas, start.skinning, pool, config, bar=bar)
+        history.found = float(pool.found.mean() / pool.points.shape[1])
+        check_found(frames, np.asarray(pool.found), pool.points.shape[1], history.notices)
+        history.lap("roots", clock)
+    return pool
+
+
 def choose_frames(
     frames: Frames, config: FitConfig, notices: list[str] | None = None
 ) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
@@ -160,7 +181,6 @@ def train_pool(
     config: FitConfig,
     *,
     held: int = 0,
-    seconds: float | None = None,
     deadline: float | None = None,
     verbose: bool = True,
     callback: Callback | None = None,
@@ -175,10 +195,9 @@ def train_pool(
 ) -> Fitted:
     """Train fields on points that are labelled already, for `config.steps` or as time allows.
 
-    `seconds` counts training steps without compilation; `deadline` is a time of
-    `time.perf_counter`. The last `held` frames of the pool are for validation. `start` is what
-    training begins from; `initial`, if it differs, what the result calls its step 0. `redraw`
-    makes new points while steps go on.
+    `deadline` is a time of `time.perf_counter`. The last `held` frames of the pool are for
+    validation. `start` is what training begins from; `initial`, if it differs, what the result
+    calls its step 0. `redraw` makes new points while steps go on.
 
     **Raises:** as `fit_fields`.
     """
@@ -189,7 +208,6 @@ def train_pool(
         betas,
         config,
         held=held,
-        seconds=seconds,
         deadline=deadline,
         callback=callback,
         history=History() if history is None else history,
@@ -209,6 +227,22 @@ def train_pool(
 def subject_betas(frames: Frames) -> np.ndarray:
     """The one shape of the person: the mean of the frames' betas."""
     return np.asarray(frames.params.betas).mean(0)
+
+
+def _of_one_shape(frames: Frames, betas: Any, notices: list[str]) -> Frames:
+    """The frames with the person's shape in place of their own: there is one canonical body.
+
+    **Warns:** `TrainingNotice` if the shapes differ; what it says is added to `notices`.
+    """
+    apart = float(np.ptp(np.asarray(frames.params.betas), axis=0).max(initial=0.0))
+    if apart > _SAME_BETAS:
+        notify(
+            f"betas differ from frame to frame, by up to {apart:.2f}: one person has one shape, "
+            "and their mean is taken for all.",
+            notices,
+            stacklevel=4,
+        )
+    return frames.with_params(with_betas(frames.params, betas), frames.body)
 
 
 def _goes_on(checkpoint: str | os.PathLike[str], resume: bool, notices: list[str]) -> bool:

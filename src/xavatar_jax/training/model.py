@@ -26,9 +26,9 @@ from ..fields import (
 )
 from .config import FitConfig, GeometryConfig, SkinningConfig
 
-# Metres around the mean shape's hands and face where detail is heard: another person's hands are
-# some centimetres away.
-_DETAIL_MARGIN = 0.1
+# Metres around hands and face where there is detail: of the mean shape, so that one start serves
+# most people, and of the person, so that it serves all.
+_DETAIL_MARGIN, _OWN_MARGIN = 0.1, 0.04
 
 
 class AvatarFields(eqx.Module):
@@ -52,10 +52,7 @@ def fresh_fields(
         skinning = _grids(body, mean_canonical_vertices(body), config.skinning, key_skinning)
     else:
         skinning = _person_grids(body, betas, config)
-    geometry = _geometry(body, config.geometry, key_geometry)
-    if betas is not None:
-        geometry = _on_person(geometry, body, betas, config.geometry)
-    return AvatarFields(skinning, geometry)
+    return AvatarFields(skinning, _geometry(body, config.geometry, key_geometry, betas))
 
 
 def _keys(config: FitConfig) -> Array:
@@ -73,66 +70,44 @@ def _grids(
 
 
 def _person_grids(body: BodyModel, betas: Any, config: FitConfig) -> GridSkinning:
-    vertices = canonical_vertices(body, jnp.asarray(betas, body.template.dtype))
-    return _grids(body, np.asarray(vertices, np.float64), config.skinning, _keys(config)[0])
+    return _grids(body, _own_vertices(body, betas), config.skinning, _keys(config)[0])
 
 
 def _moves_grids(config: FitConfig) -> bool:
     return config.losses.surface > 0 or config.skinning.start == "random"
 
 
-def _on_person(
-    geometry: AbstractGeometryField, body: BodyModel, betas: Any, config: GeometryConfig
+def _geometry(
+    body: BodyModel, config: GeometryConfig, key: Array, betas: Any = None
 ) -> AbstractGeometryField:
-    """A field whose condition is heard around the person's own joints, and moves their own face."""
-    if not isinstance(geometry, HashGeometry):
-        return geometry
-    betas = jnp.asarray(betas, body.template.dtype)
-    joints = jnp.asarray(canonical_joints(body, betas), jnp.float32)
-    moves = None
-    if config.expression_moves:
-        vertices = np.asarray(canonical_vertices(body, betas), np.float64)
-        known = geometry.expression_range.shape[1]
-        moves = template_expression(body, vertices, config.expression_moves, known)
-    return eqx.tree_at(
-        lambda g: (g.joints, g.moves), geometry, (joints, moves), is_leaf=lambda x: x is None
-    )
+    """A geometry field for the mean shape, or for a person.
 
-
-def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGeometryField:
+    Of grids, a person has joints around which rotations act, places that the body model's
+    expression moves, and boxes of detail that reach around their own hands and face.
+    """
     expression = min(body.num_expression, 10)
     if config.kind == "mlp":
         return MLPGeometry(body.tree, expression, config.mlp, key=key)
-    vertices = mean_canonical_vertices(body)
-    labels = np.asarray(body.part_labels)
-    detail = []
-    for members, spacing in (
-        ((LEFT_HAND,), config.hands),
-        ((RIGHT_HAND,), config.hands),
-        (FACES, config.face),
-    ):
-        own = vertices[np.isin(labels, members)]
-        if len(own):
-            detail.append((own.min(0) - _DETAIL_MARGIN, own.max(0) + _DETAIL_MARGIN, spacing))
+    mean = mean_canonical_vertices(body)
+    own = None if betas is None else _own_vertices(body, betas)
+    detail, face = _detail(body, config, mean, own)
     expressive = None
-    if expression and np.isin(labels, FACES).any():
-        low, high, _ = detail[-1]
+    if expression and face is not None:
         expressive = ExpressionGrid(
-            low,
-            high,
+            *face,
             spacing=config.expression_spacing,
             num_expression=expression,
             features=config.expression_features,
         )
-    return HashGeometry(
+    geometry = HashGeometry(
         body.tree,
         np.asarray(canonical_joints(body, jnp.zeros(0, body.template.dtype))),
         expressive,
-        vertices.min(0) - config.box_margin,
-        vertices.max(0) + config.box_margin,
+        mean.min(0) - config.box_margin,
+        mean.max(0) + config.box_margin,
         spacing=config.spacing,
         trunk_spacing=config.trunk,
-        detail=tuple(detail),
+        detail=detail,
         features=config.features,
         log2_size=config.log2_size,
         width=config.width,
@@ -140,6 +115,54 @@ def _geometry(body: BodyModel, config: GeometryConfig, key: Array) -> AbstractGe
         sharpness=config.sharpness,
         key=key,
     )
+    if own is None:
+        return geometry
+    joints = canonical_joints(body, jnp.asarray(betas, body.template.dtype))
+    moves = None
+    if config.expression_moves:
+        known = geometry.expression_range.shape[1]
+        moves = template_expression(body, own, config.expression_moves, known)
+    return eqx.tree_at(
+        lambda g: (g.joints, g.moves),
+        geometry,
+        (jnp.asarray(joints, jnp.float32), moves),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _own_vertices(body: BodyModel, betas: Any) -> Float[np.ndarray, "V 3"]:
+    vertices = canonical_vertices(body, jnp.asarray(betas, body.template.dtype))
+    return np.asarray(vertices, np.float64)
+
+
+_Box = tuple[np.ndarray, np.ndarray]
+
+
+def _detail(
+    body: BodyModel,
+    config: GeometryConfig,
+    mean: Float[np.ndarray, "V 3"],
+    own: Float[np.ndarray, "V 3"] | None,
+) -> tuple[tuple[tuple[np.ndarray, np.ndarray, float], ...], _Box | None]:
+    """Boxes of detail, each with the spacing in it, and the one of the face, if there is a face."""
+    labels = np.asarray(body.part_labels)
+    detail, face = [], None
+    for members, spacing in (
+        ((LEFT_HAND,), config.hands),
+        ((RIGHT_HAND,), config.hands),
+        (FACES, config.face),
+    ):
+        rows = np.isin(labels, members)
+        if not rows.any():
+            continue
+        low, high = mean[rows].min(0) - _DETAIL_MARGIN, mean[rows].max(0) + _DETAIL_MARGIN
+        if own is not None:
+            low = np.minimum(low, own[rows].min(0) - _OWN_MARGIN)
+            high = np.maximum(high, own[rows].max(0) + _OWN_MARGIN)
+        detail.append((low, high, spacing))
+        if members == FACES:
+            face = low, high
+    return tuple(detail), face
 
 
 def lay_on_person(
@@ -154,34 +177,40 @@ def lay_on_person(
     weights where that term is off (ablation A4). Grids that start at random are only moved to the
     person, and know no weights of the template.
     """
-    skinning = fields.skinning
+    skinning, geometry = fields.skinning, fields.geometry
     if isinstance(skinning, GridSkinning) and _moves_grids(config):
         skinning = _person_grids(body, betas, config)
-    geometry = _on_person(fields.geometry, body, betas, config.geometry)
+    if isinstance(geometry, HashGeometry):
+        own = _geometry(body, config.geometry, _keys(config)[1], betas)
+        # What the fit to the mean shape has changed: it knows no pose and no expression.
+        geometry = eqx.tree_at(_shape_leaves, own, _shape_leaves(geometry))
     return AvatarFields(skinning, geometry)
+
+
+def _shape_leaves(geometry: Any) -> Any:
+    return geometry.encoding, geometry.hidden, geometry.biases
 
 
 def trainable_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
     """A tree of booleans: which leaves are learned. Template arrays and grids never are."""
-    learned = jax.tree.map(eqx.is_inexact_array, fields)
-    if isinstance(fields.skinning, GridSkinning):
-        frozen = jax.tree.map(lambda _: False, fields.skinning)
-        frozen = eqx.tree_at(lambda s: s.correction, frozen, config.skinning.learned)
-        learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
-    elif not config.skinning.learned:
-        frozen = jax.tree.map(lambda _: False, fields.skinning)
-        learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
-    if isinstance(fields.geometry, HashGeometry):
-        learned = eqx.tree_at(
-            lambda f: (*f.geometry.told, *jax.tree.leaves(f.geometry.moves)),
-            learned,
-            replace_fn=lambda _: False,
-        )
+    skinning = trainable_skinning(fields.skinning, learned=config.skinning.learned)
+    return AvatarFields(skinning, trainable_geometry(fields.geometry))
+
+
+def trainable_skinning(
+    skinning: AbstractSkinningField, *, learned: bool = True
+) -> AbstractSkinningField:
+    """Of skinning grids the correction, of others every floating-point leaf; or none."""
+    if isinstance(skinning, GridSkinning):
+        frozen = jax.tree.map(lambda _: False, skinning)
+        return eqx.tree_at(lambda s: s.correction, frozen, learned)
+    return jax.tree.map(lambda leaf: learned and eqx.is_inexact_array(leaf), skinning)
+
+
+def trainable_geometry(geometry: AbstractGeometryField) -> AbstractGeometryField:
+    """Every floating-point leaf but the `fixed_leaves` and the `moves` of a hash-grid field."""
+    learned = jax.tree.map(eqx.is_inexact_array, geometry)
+    if isinstance(geometry, HashGeometry):
+        fixed = lambda g: (*g.fixed_leaves, *jax.tree.leaves(g.moves))  # noqa: E731
+        learned = eqx.tree_at(fixed, learned, replace_fn=lambda _: False)
     return learned
-
-
-def as_dtype(fields: AvatarFields, dtype: Any) -> AvatarFields:
-    """The same fields with floating-point leaves of another type."""
-    return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, fields
-    )

@@ -93,7 +93,9 @@ def geometry_objective(
     )
     logit = jax.vmap(jax.vmap(fields.geometry, in_axes=(0, None)))(chosen, conditions)
     terms = {
-        "occupancy": _divergence(logit, batch.distance, config).mean(),
+        "occupancy": jnp.where(
+            batch.rooted, _divergence(logit, batch.distance, config), 0.0
+        ).mean(),
         "bone": _bone_term(fields, anchors, conditions, key),
     }
     return weighted(terms, config), terms
@@ -108,9 +110,10 @@ def skinning_objective(
         fields, batch.root, batch.others, batch.others_valid, conditions
     )
     logit, regular = _logit_through_root(fields, chosen, batch, conditions)
-    entropy = jnp.where(regular, _divergence(logit, batch.distance, config), 0.0)
+    use = regular & batch.rooted
+    entropy = jnp.where(use, _divergence(logit, batch.distance, config), 0.0)
     terms = {
-        "occupancy": entropy.sum() / jnp.maximum(regular.sum(), 1),
+        "occupancy": entropy.sum() / jnp.maximum(use.sum(), 1),
         **weight_terms(fields.skinning, anchors, config, key),
     }
     return weighted(terms, config), {f"skinning_{name}": term for name, term in terms.items()}
@@ -133,7 +136,7 @@ def full_objective(
         (fields.skinning, guide),
         batch,
     )
-    chosen, found = jax.vmap(_best_root, in_axes=(None, 0, 0, 0))(fields, roots, valid, conditions)
+    chosen, found = jax.vmap(best_root, in_axes=(None, 0, 0, 0))(fields, roots, valid, conditions)
     logit, regular = _logit_through_root(fields, chosen, batch, conditions)
     use = found & regular
     entropy = jnp.where(use, _divergence(logit, batch.distance, config), 0.0)
@@ -209,13 +212,16 @@ def _logit_through_root(
     return jax.vmap(over_points)(chosen, batch.points, batch.transforms, conditions)
 
 
-def _best_root(
+def best_root(
     fields: AvatarFields,
     roots: Float[Array, "M K 3"],
     valid: Bool[Array, "M K"],
     condition: Any,
 ) -> tuple[Float[Array, "M 3"], Bool[Array, " M"]]:
-    """The root with the largest logit, and whether there is one (X-Avatar, section 3.3)."""
+    """Of K roots of each point the one with the largest logit, and whether there is one.
+
+    Source: X-Avatar, section 3.3. Which root it is has no derivative.
+    """
     geometry, condition = jax.lax.stop_gradient((fields.geometry, condition))
     logits = jax.vmap(jax.vmap(lambda x: geometry(x, condition)))(roots)
     best = jnp.argmax(jnp.where(valid, logits, -jnp.inf), axis=-1)
@@ -238,7 +244,7 @@ def _best_stored(
         return root
     roots = jnp.concatenate([root[:rows, None], others], axis=1)
     valid = jnp.concatenate([jnp.ones((rows, 1), bool), others_valid], axis=1)
-    best, _ = _best_root(fields, roots, valid, condition)
+    best, _ = best_root(fields, roots, valid, condition)
     return jnp.concatenate([best, root[rows:]])
 
 

@@ -214,6 +214,8 @@ def _search_frame(
 
 def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool:
     """Rows by their number of roots; valid roots come first in a row already."""
+    # What a search that failed has come to may be anything, NaN too: masked values are finite.
+    roots = np.where(valid[..., None], roots, 0)
     count = valid.sum(-1)
     order = np.argsort(-count, axis=1, kind="stable")
     several = (count > 1).sum(1)

@@ -18,12 +18,13 @@ from jaxtyping import Array
 from .._version import __version__
 from ..body import FACES, HANDS, BodyModel, BodyParams
 from ..fields import mean_canonical_vertices, template_weights
-from ..files import cache_dir, flatten_named, load_arrays, save_arrays, unflatten_named
+from ..files import cache_path, flatten_named, load_arrays, save_arrays, unflatten_named
 from ..geometry import face_areas
 from ..losses import binary_cross_entropy, soft_occupancy
 from ..sampling import signed_distance
+from .check import notify
 from .config import FitConfig
-from .model import AvatarFields, fresh_fields, trainable_filter
+from .model import AvatarFields, fresh_fields, trainable_geometry, trainable_skinning
 from .progress import progress
 
 _REVISION = 3  # raised when the fit below changes: it keys the cache
@@ -52,15 +53,17 @@ def initial_fields(
             __version__,
             _REVISION,
             body.source.checksum,
+            body.num_expression,
             asdict(config.skinning),
             asdict(config.geometry),
             config.prefit_steps,
             config.losses.softness,
+            [getattr(config.optimiser, name) for name in ("learning_rate", "clip", "epsilon")],
             config.seed,
         ]
     )
     name = hashlib.sha256(fingerprint.encode()).hexdigest()[:16]
-    path = cache_dir(cache) / f"prefit-{config.preset}-{name}.npz"
+    path = cache_path(cache) / f"prefit-{config.preset}-{name}.npz"
     # The template's grids are made anew: only what the fit changes is kept.
     arrays = eqx.filter(fields, _prefit_filter(fields, config))
     if path.exists():
@@ -68,7 +71,15 @@ def initial_fields(
         return eqx.combine(unflatten_named(arrays, saved, source=str(path)), fields)
     fields = _fit_mean_shape(body, fields, config, verbose=verbose)
     kept = eqx.filter(fields, _prefit_filter(fields, config))
-    save_arrays(path, flatten_named(kept), {"kind": "prefit"})
+    try:
+        save_arrays(path, flatten_named(kept), {"kind": "prefit"})
+    except OSError as error:
+        notify(
+            f"the fields fitted to the mean shape are not kept ({error}): the next run fits them "
+            "again. Another folder may be given: cache=FOLDER, or --cache-dir.",
+            None,
+            stacklevel=2,
+        )
     return fields
 
 
@@ -130,11 +141,8 @@ def _step(
 def _prefit_filter(fields: AvatarFields, config: FitConfig) -> AvatarFields:
     """Geometry always; skinning where it is a network (a grid already holds the template), and
     where it does not start at random."""
-    learned = trainable_filter(fields, config)
-    if not _fits_skinning(config):
-        frozen = jax.tree.map(lambda _: False, fields.skinning)
-        learned = eqx.tree_at(lambda f: f.skinning, learned, frozen)
-    return learned
+    skinning = trainable_skinning(fields.skinning, learned=_fits_skinning(config))
+    return AvatarFields(skinning, trainable_geometry(fields.geometry))
 
 
 def _fits_skinning(config: FitConfig) -> bool:

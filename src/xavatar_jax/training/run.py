@@ -60,7 +60,6 @@ class Run:
         config: FitConfig,
         *,
         held: int,
-        seconds: float | None,
         deadline: float | None,
         callback: Callback | None,
         history: History,
@@ -77,7 +76,7 @@ class Run:
         self.config = replace(
             config, points_per_step=min(config.points_per_step, pool.points.shape[1])
         )
-        self.seconds, self.deadline = seconds, deadline
+        self.deadline = deadline
         self.callback, self.history, self.learned_from = callback, history, learned_from
         self.keeper, self.log, self.devices = keeper, log, devices
         self.redraw = redraw
@@ -112,6 +111,8 @@ class Run:
         self.state, self.pool = devices.replicate(state), devices.replicate(pool)
         self.guide = self._tabulated(state.guide) if has_guide(config) else None
         self.began, self.trained = self.at, history.seconds.get("train", 0.0)
+        jax.block_until_ready(self.guide)
+        self._book("compile")
         self.compiled: set[str] = set()
         self.unchecked: tuple[int, dict[str, Any]] | None = None
         if redraw is not None:
@@ -170,7 +171,8 @@ class Run:
         fresh = name not in self.compiled
         if fresh:
             self._book("train")
-        self.state, terms = self.steps[name](self.state, self.pool, self.guide)
+        k = self.devices.replicate(jnp.asarray(self.at, jnp.int32))
+        self.state, terms = self.steps[name](self.state, self.pool, self.guide, k)
         self.at += 1
         previous, self.unchecked = self.unchecked, (self.at, terms)
         self._check(previous)
@@ -225,9 +227,7 @@ class Run:
         if jax.process_count() > 1 and self.at % self.config.report_every:
             return ""
         self._book("train")
-        used = self.history.seconds.get("train", 0.0) - self.trained
-        late = self.seconds is not None and used > self.seconds
-        late |= self.deadline is not None and time.perf_counter() > self.deadline
+        late = self.deadline is not None and time.perf_counter() > self.deadline
         if self.devices.agree(flag.number != 0):
             return "interrupt"
         return "minutes" if self.devices.agree(late) else ""
@@ -380,7 +380,7 @@ class Run:
 
     def _fail(self, step: int, name: str, value: float) -> NoReturn:
         """Keep the last good state and say which term is to blame."""
-        # A step that is not finite changes nothing, so the state is the one before it.
+        # Neither that step nor the one after it, which has begun, has changed the state.
         self.at = int(self.state.step)
         self.latest = {
             n: v for n, v in ((n, float(v)) for n, v in self.latest.items()) if math.isfinite(v)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..body import BodyModel
 from ..fields import GridSkinning
 from .config import FitConfig, for_programs
-from .model import AvatarFields, lay_on_person, trainable_filter
+from .model import AvatarFields, lay_on_person, trainable_skinning
 from .objective import Anchors, make_anchors, weight_terms, weighted
 from .progress import progress
 from .step import cosine, make_optimiser
@@ -42,7 +42,7 @@ def settle_on_person(
     if at_once or not config.skinning.learned or not config.settle_steps:
         return fields
     anchors = make_anchors(body, jnp.asarray(betas), config)
-    learned, fixed = eqx.partition(fields.skinning, trainable_filter(fields, config).skinning)
+    learned, fixed = eqx.partition(fields.skinning, trainable_skinning(fields.skinning))
     fixed_arrays, static = eqx.partition(fixed, eqx.is_array)
     state = make_optimiser(config).init(learned)
     constant = (anchors, fixed_arrays)

@@ -64,7 +64,8 @@ class TrainState(eqx.Module):
 
 
 Step = Callable[
-    [TrainState, FramePool, TabulatedSkinning | None], tuple[TrainState, dict[str, Array]]
+    [TrainState, FramePool, TabulatedSkinning | None, Int[Array, ""]],
+    tuple[TrainState, dict[str, Array]],
 ]
 
 
@@ -133,6 +134,7 @@ def batch_of(
         parts=take(pool.parts).astype(jnp.int32),
         distance=take(pool.distance),
         root=take(pool.root),
+        rooted=rows < pool.found[chosen, None],
         others=take(pool.others, rows[:, :several]),
         others_valid=take(pool.others_valid, rows[:, :several]),
         transforms=pool.transforms[chosen],
@@ -169,11 +171,13 @@ def make_steps(
 ) -> tuple[TrainState, dict[str, Step]]:
     """The first state, and the jitted steps by what they learn.
 
-    A step is `(state, pool, guide) -> (state, terms)`; `guide` is None unless `has_guide(config)`.
+    A step is `(state, pool, guide, k) -> (state, terms)`; `guide` is None unless
+    `has_guide(config)`, and `k` is the number of steps done.
     With stored roots there is one for "geometry" and, if it is learned, one for "skinning"; with
     roots searched in the step one for "both"; `terms` are added to each. Draws are keyed by seed
     and step number alone, and leave out the pool's last `held` frames. A step whose loss or
-    gradient is not finite changes nothing.
+    gradient is not finite changes nothing, and neither do those that are begun after it before
+    anybody has looked: their `k` is not the state's.
     """
     learned, fixed = eqx.partition(fields, trainable_filter(fields, config))
     # A copy: a step gives its input state's memory to the next one.
@@ -185,8 +189,8 @@ def make_steps(
     read = for_programs(config)
 
     def bind(plan: _Plan) -> Step:
-        return lambda state, pool, guide: _step(
-            (pool, guide, anchors, fixed_arrays, dict(terms or {})),
+        return lambda state, pool, guide, k: _step(
+            (pool, guide, anchors, fixed_arrays, k, dict(terms or {})),
             *(state, static, plan, read, devices),
         )
 
@@ -253,14 +257,14 @@ def _at_rates(updates: Any, name: str, config: FitConfig, left: Array) -> Any:
 # Made once: a second run of the same shapes and options does not compile again.
 @eqx.filter_jit(donate="all-except-first")
 def _step(
-    constant: tuple[FramePool, TabulatedSkinning | None, Anchors, Any, ExtraTerms],
+    constant: tuple[FramePool, TabulatedSkinning | None, Anchors, Any, Int[Array, ""], ExtraTerms],
     state: TrainState,
     static: Any,
     plan: _Plan,
     config: FitConfig,
     devices: Devices,
 ) -> tuple[TrainState, dict[str, Array]]:
-    pool, guide, anchors, fixed_arrays, extra = constant
+    pool, guide, anchors, fixed_arrays, k, extra = constant
     name = plan.name
     prefix = "skinning_" if name == "skinning" else ""
     objective = {
@@ -287,7 +291,7 @@ def _step(
     optimisers = {**state.optimisers, name: optimiser_state}
     after = TrainState(learned, optimisers, state.step + 1, state.fall, state.guide)
     size = optax.tree.norm(gradient)
-    good = jnp.isfinite(total) & jnp.isfinite(size)
+    good = jnp.isfinite(total) & jnp.isfinite(size) & (state.step == k)
     after = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state)
     return devices.whole(after), {f"{prefix}loss": total, f"{prefix}gradient": size, **terms}
 

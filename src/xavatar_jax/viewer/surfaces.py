@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from ..avatar import Avatar
-from ..avatar.animate import posed_frame
+from ..avatar.animate import posed_frame, spread_frames
 from ..body import BodyParams
 from ..frames import Frames
 from ..geometry import closest_points, vertex_normals
@@ -84,8 +84,7 @@ class Surfaces:
 
     def ground_height(self) -> float:
         """The lowest point of the body in some frames of the motion, along the up axis."""
-        count = len(self.params)
-        some = np.unique(np.linspace(0, count - 1, min(count, 6)).round().astype(int))
+        some = spread_frames(len(self.params), 6)
         return float(min((self.template(int(k)).vertices @ self.up).min() for k in some))
 
     def __call__(self, wish: Wish) -> Surface:
@@ -103,7 +102,7 @@ class Surfaces:
             normals = vertex_normals(vertices, faces)
             colors = np.round(255 * (0.5 + 0.5 * normals)).astype(np.uint8)
         elif wish.shading == WEIGHTS:
-            colors = weight_colors(np.asarray(self.avatar.posable.weights).T, wish.bone)
+            colors = weight_colors(np.asarray(self.avatar.neutral_surface.weights).T, wish.bone)
         return Surface(vertices, faces, colors=colors)
 
     def _against_truth(self, wish: Wish, own: BodyParams, shift: Float[np.ndarray, "3"]) -> Surface:

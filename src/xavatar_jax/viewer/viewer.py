@@ -113,7 +113,7 @@ class Viewer:
         self.panel.say("The avatar's surface is being extracted; until then the body is shown.")
         self._stage.show(self._surfaces.template(0))
         self._stage.place_ground(self._surfaces.ground_height())
-        self._surfaces.avatar.posable  # noqa: B018  # the surface and what is kept of it
+        self._surfaces.avatar.neutral_surface  # noqa: B018  # the surface and what is kept of it
         self.panel.say("")
         clock = _Clock(self.panel, self._fps)
         while not self._stopped.is_set():

@@ -1,4 +1,4 @@
-"""SCANimate's networks: forward and inverse skinning, a distance that hears the pose locally."""
+"""SCANimate's networks: forward and inverse skinning, a distance that reads the pose locally."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...fields import AbstractGeometryField, AbstractSkinningField, ImplicitMLP,
 from ...kinematics import KinematicTree
 
 _FLOOR = 1e-4  # added to known weights: zeros have no logarithm
-_STEPS = 4  # along the tree, that a joint's rotation is heard
+_STEPS = 4  # along the tree, that a joint's rotation is read
 
 
 class SoftmaxSkinning(AbstractSkinningField):
@@ -27,7 +27,7 @@ class SoftmaxSkinning(AbstractSkinningField):
         self.mlp = ImplicitMLP(shape, outputs=tree.num_joints, key=key)
 
     def __call__(self, x_c: Float[Array, "3"]) -> Float[Array, " J"]:
-        return jax.nn.softmax(self.mlp(x_c)[0])
+        return jax.nn.softmax(self.mlp(x_c))
 
     def covers(self, x_c: Float[Array, "3"]) -> Array:
         return jnp.all(jnp.isfinite(x_c))
@@ -66,7 +66,7 @@ class InverseSkinning(eqx.Module):
         self, x_d: Float[Array, "3"], latent: Float[Array, " k"], known: Float[Array, " J"]
     ) -> Float[Array, " J"]:
         """Weights at `x_d`, metres in the frame of the posed root."""
-        logits, _ = self.mlp(x_d, latent)
+        logits = self.mlp(x_d, latent)
         if self.known:
             logits = logits + jnp.log(known + _FLOOR)
         return jax.nn.softmax(logits)
@@ -104,8 +104,8 @@ class LocalPoseMLP(AbstractGeometryField):
 
     def __call__(self, x_c: Float[Array, "3"], condition: Float[Array, "j 4"]) -> Float[Array, ""]:
         weights = jax.lax.stop_gradient(self.skinning(x_c))
-        heard = weights @ jnp.asarray(adjacency(self.tree)[:, 1:], weights.dtype)
-        out, _ = self.mlp(x_c, (heard[:, None] * condition).reshape(-1))
+        shares = weights @ jnp.asarray(adjacency(self.tree)[:, 1:], weights.dtype)
+        out = self.mlp(x_c, (shares[:, None] * condition).reshape(-1))
         return out[0] / self.softness
 
 
@@ -117,7 +117,7 @@ def quaternions(rotation: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
 
 @lru_cache
 def adjacency(tree: KinematicTree) -> Float[np.ndarray, "J J"]:
-    """How much of a joint's rotation a bone hears: less with each step along the tree, up to four.
+    """How much of a joint's rotation a bone reads: less with each step along the tree, up to four.
 
     Rows, one a bone, sum to one.
     """
@@ -129,5 +129,5 @@ def adjacency(tree: KinematicTree) -> Float[np.ndarray, "J J"]:
     for step in range(_STEPS + 1):
         away[reached & (away > step)] = step
         reached = reached | (reached @ linked)
-    heard = (_STEPS + 1.0 - away) / (_STEPS + 1)
-    return heard / heard.sum(1, keepdims=True)
+    share = (_STEPS + 1.0 - away) / (_STEPS + 1)
+    return share / share.sum(1, keepdims=True)

@@ -28,12 +28,13 @@ from ...training import (
     initial_fields,
     settle_on_person,
     subject_betas,
-    trainable_filter,
+    trainable_geometry,
+    trainable_skinning,
 )
-from ...training.budget import frames_in_budget
+from ...training.budget import check_minutes, frames_in_budget
 from ...training.progress import progress
 from ...training.step import cosine
-from ..baseline import Baseline, check_minutes
+from ..baseline import Baseline
 from ..skeleton import body_only, body_only_frames
 from .config import ScanimateConfig, Stage, scanimate_quick
 from .fields import InverseSkinning, LocalPoseMLP, SoftmaxSkinning
@@ -98,7 +99,7 @@ def fit_scanimate(
         clock = history.lap(name, clock)
     hands = static_hands(whole, frames.params, betas) if config.hands == "body" else None
     canonical = _canonical(nets, scans, hands, config)
-    geometry = _hears(fields.geometry.within(learned_from.params), nets.forward)
+    geometry = _with_skinning(fields.geometry.within(learned_from.params), nets.forward)
     clock = history.lap("canonical", clock)
     geometry = _run(
         "shape",
@@ -149,7 +150,7 @@ def start_fields(
     return initial_fields(body, config.start, cache=cache, verbose=verbose, fields=own)
 
 
-def _hears(geometry: Any, skinning: AbstractSkinningField) -> Any:
+def _with_skinning(geometry: Any, skinning: AbstractSkinningField) -> Any:
     """A local network reads the weights of this field from now on."""
     if isinstance(geometry, LocalPoseMLP):
         return eqx.tree_at(lambda g: g.skinning, geometry, skinning)
@@ -250,12 +251,13 @@ def _run(
                 began = time.perf_counter()
             history.steps_done += 1
             bar.update(1)
-            if k % _REPORT_EVERY == 0 or k == stage.steps - 1:
-                values = {f"{name}_{n}": float(v) for n, v in terms.items()}
-                _check(values, name, k)
+            if k % _REPORT_EVERY == 0:
+                values = _checked(terms, name, k)
                 history.record(history.steps_done, values)
                 bar.set_postfix(loss=f"{values[f'{name}_loss']:.5f}")
-    jax.block_until_ready(learned)
+    # What follows is made of these fields, whatever ended the stage.
+    if history.steps_done not in history.steps:
+        history.record(history.steps_done, _checked(terms, name, k))
     history.best_step = history.steps_done
     return eqx.combine(learned, fixed)
 
@@ -300,11 +302,9 @@ def _optimiser(config: ScanimateConfig) -> optax.GradientTransformation:
 def _learned(model: Any, config: ScanimateConfig) -> Any:
     """A tree of booleans: which leaves a stage learns."""
     if isinstance(model, SkinNets):
-        both = AvatarFields(model.forward, None)  # pyright: ignore[reportArgumentType]
-        forward = trainable_filter(both, config.start).skinning
+        forward = trainable_skinning(model.forward, learned=config.start.skinning.learned)
         return SkinNets(forward, jax.tree.map(eqx.is_inexact_array, model.inverse))
-    both = AvatarFields(None, model)  # pyright: ignore[reportArgumentType]
-    mask = trainable_filter(both, config.start).geometry
+    mask = trainable_geometry(model)
     if isinstance(model, LocalPoseMLP):
         mask = eqx.tree_at(
             lambda m: m.skinning, mask, jax.tree.map(lambda _: False, model.skinning)
@@ -327,7 +327,9 @@ def _shape_loss(geometry: Any, constant: Any, config: Any, done: Any, key: Any):
     return shape_objective(geometry, scans, template, config, key)
 
 
-def _check(values: dict[str, float], name: str, step: int) -> None:
+def _checked(terms: dict[str, Array], name: str, step: int) -> dict[str, float]:
+    """The terms of a step by their names in the history, if all are finite."""
+    values = {f"{name}_{n}": float(v) for n, v in terms.items()}
     # The sum comes last: it is not finite because a term is not.
     for term in sorted(values, key=lambda n: n.endswith("loss")):
         if not math.isfinite(values[term]):
@@ -338,3 +340,4 @@ def _check(values: dict[str, float], name: str, step: int) -> None:
                 step=step,
                 term=term,
             )
+    return values
