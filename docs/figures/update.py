@@ -22,6 +22,7 @@ import sys
 from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +36,7 @@ TEXTS = (
     "docs/options.md",
     "docs/view-and-render.md",
 )
-METRICS, PART_AWARE = "metrics.json", "part_aware_vs_all_bones.json"
+METRICS, SEEDS, PART_AWARE = "metrics.json", "metrics_seeds.json", "part_aware_vs_all_bones.json"
 ANIMATE, VIEW = "animate.json", "view_and_render.json"
 PAPER, SURFACE = "metrics_paper.json", "surface_paper.json"
 SEARCH, GRADIENTS = "correspondence.json", "gradients.json"
@@ -160,6 +161,27 @@ def accuracy_view(record: dict[str, Any]) -> str:
         f"{record['peak_rss_mb'] / 1024:.1f} GiB of memory at most. "
         f"*Before* is the start, the body's mean shape on the person's skeleton, "
         f"on {few} of the frames."
+    )
+
+
+def seeds_view(record: dict[str, Any]) -> str:
+    """Medians over runs with other seeds, and from where to where their figures go."""
+    runs = record["runs"]
+    rows = [[f"{len(runs)} seeds", *REGIONS]]
+    for name, label, digits in _FIGURES:
+        row = [label]
+        for region in REGIONS:
+            values = sorted(run[name][region] for run in runs)
+            low, middle, high = (
+                _number(v, digits) for v in (values[0], median(values), values[-1])
+            )
+            row.append(f"{middle} ({low} to {high})")
+        rows.append(row)
+    seeds = ", ".join(str(run["seed"]) for run in runs)
+    seconds = sorted(run["seconds"]["total"] for run in runs)
+    return (
+        f"{_table(rows)}\n\n{_sentence(_machine(runs[0]))}; seeds {seeds}, {seconds[0]:.0f} to "
+        f"{seconds[-1]:.0f} s in all."
     )
 
 
@@ -525,6 +547,7 @@ VIEWS: dict[str, Callable[[dict[str, Any]], str]] = {
     f"docs/figures/{METRICS}": accuracy_view,
     f"docs/figures/{METRICS} stages": stages_view,
     f"docs/figures/{METRICS} distance": distance_view,
+    f"docs/figures/{SEEDS}": seeds_view,
     f"docs/figures/{PAPER}": paper_view,
     f"docs/figures/{PART_AWARE}": benchmark_view,
     f"docs/figures/{ANIMATE}": animate_view,
@@ -591,7 +614,10 @@ def _sentence(text: str) -> str:
 
 
 def _store(source: str, name: str, slim: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    record = slim(json.loads(Path(source).read_text("utf-8")))
+    _write(name, slim(json.loads(Path(source).read_text("utf-8"))))
+
+
+def _write(name: str, record: dict[str, Any]) -> None:
     text = json.dumps(record, indent=2, allow_nan=False)
     (FOLDER / name).write_text(text + "\n", encoding="utf-8")
 
@@ -631,9 +657,13 @@ def main() -> None:
     parser.add_argument("--table1", help="JSON of benchmarks/table1_ablations.py")
     parser.add_argument("--table2", help="JSON of benchmarks/table2_grab.py")
     parser.add_argument("--curve", help="JSON of benchmarks/accuracy_over_time.py")
+    parser.add_argument("--metrics-seeds", nargs="+", help="several metrics.json, one a seed")
     args = parser.parse_args()
     for option, source in vars(args).items():
-        if source:
+        if option == "metrics_seeds" and source:
+            runs = [slim_metrics(json.loads(Path(file).read_text("utf-8"))) for file in source]
+            _write(SEEDS, {"runs": runs})
+        elif source:
             slim = slim_metrics if option.startswith("metrics") else slim_benchmark
             _store(source, _STORED[option], slim)
     for name in TEXTS:
