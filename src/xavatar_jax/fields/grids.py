@@ -81,9 +81,11 @@ class PartGrids(eqx.Module):
         cell = self.index[self.offset[grid] + flat]
         # Where a fine box leaves the answer to the coarse grid, the place is that in its cell.
         coarse = cell < self.coarse_cells
-        ratio = jnp.round(self.spacing[0] / self.spacing).astype(jnp.int32)[grid][..., None]
-        place = (ijk % ratio + fraction) / ratio
-        fraction = jnp.where(coarse[..., None], place, fraction)
+        # In floating point: vector code has no division of integers.
+        ratio = jnp.round(self.spacing[0] / self.spacing).astype(x.dtype)[grid][..., None]
+        share = 1 / ratio
+        first = ratio * jnp.floor((ijk + 0.5) * share)
+        fraction = jnp.where(coarse[..., None], (ijk - first + fraction) * share, fraction)
         return cell, fraction, jnp.where(coarse, self.spacing[0].astype(x.dtype), spacing)
 
     def covers(self, x: Float[Array, "*p 3"]) -> Bool[Array, "*p"]:
