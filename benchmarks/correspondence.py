@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from measuring import least_time, peak_rise_mb, print_rows
+from measuring import least_time, peak_rise_mb, print_rows, write_result
 from resumable import rows_of
 from search_problems import (
     FULL_PREFIT,
@@ -65,7 +65,7 @@ from xavatar_jax.fields import (
     tabulate,
 )
 from xavatar_jax.render import grid_picture, save_png
-from xavatar_jax.report import describe_machine, line_chart, write_json
+from xavatar_jax.report import describe_machine, line_chart
 
 # Points that share one tabulating and one blending of transforms in `points_per_s_with_tables`.
 SHARED_BY = 100_000
@@ -579,8 +579,7 @@ def main() -> None:
         rows += [{**row, "commit": header["commit"]} for row in measured]
         if args.json:
             header["peak_rss_mb"] = describe_machine()["peak_rss_mb"]
-            write_json(args.json, {"header": header, "rows": rows})
-            print(f"written: {args.json}", flush=True)
+            write_result(args.json, header, rows)
     if args.picture:
         draw(rows, args.picture)
         print(f"written: {args.picture}")

@@ -173,4 +173,6 @@ def test_paper_settings_are_the_published_sizes():
 @pytest.mark.parametrize("minutes", [0, -1.0, float("nan")])
 def test_budgets_are_positive(frames, minutes):
     with pytest.raises(ValueError, match="minutes must be a positive number"):
+        fit_snarf(frames, replace(snarf_quick(), minutes=minutes))
+    with pytest.raises(ValueError, match="minutes must be a positive number"):
         fit_scanimate(frames, replace(scanimate_quick(), minutes=minutes))

@@ -176,7 +176,6 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         unique, inverse = np.unique(corner @ stride, return_inverse=True)
         position = np.stack(np.unravel_index(unique, tuple(shape + 1)), 1)
         nodes.append(origin + position * step)
-        depths.append(step * _nodes_to_edge(near)[tuple(position.T)])
         cells.append(inverse.reshape(-1, 8) + node_count)
         covered.append(np.ones(len(flat), bool))
         order = np.full(near.shape, -1)
@@ -194,6 +193,7 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         else:
             first = np.rint((origin - coarse_low) / coarse_step).astype(int)
             ratio = int(np.rint(coarse_step / step))
+            depths.append(step * _nodes_to_edge(near)[tuple(position.T)])
             under = [first[k] + np.arange(shape[k]) // ratio for k in range(3)]
             dense = np.where(near, order, coarse_index[np.ix_(*under)])
         index.append(dense.ravel())
@@ -279,7 +279,7 @@ def _margins(
         depth = np.minimum(local, shape * step - local).min(1)
         t = np.minimum(
             np.clip(depth / (spacing.margin * spacing.body), 0, 1),
-            np.clip(depths[g] / (spacing.fine_margin * spacing.body), 0, 1),
+            np.clip(depths[g - 1] / (spacing.fine_margin * spacing.body), 0, 1),
         )
         share = 1 - t * t * (3 - 2 * t)
         rows = np.flatnonzero(share > 0)
