@@ -87,6 +87,20 @@ def test_each_kind_from_each_format(tmp_path, chumpy_array, kind, suffix):
     np.testing.assert_allclose(body.joint_template, joints, atol=1e-6)
 
 
+def test_a_checksum_is_of_contents(tmp_path):
+    arrays = toy_arrays(PARENTS["smplx"], columns=COLUMNS["smplx"])
+    one = load_body(write_npz(tmp_path / "a.npz", arrays))
+    (tmp_path / "b.pkl").write_bytes(pickle.dumps(arrays, 2))
+    few = load_body(tmp_path / "b.pkl", num_betas=2, num_expression=1)
+    assert few.source.checksum == one.source.checksum
+    rounded = {**arrays, "v_template": arrays["v_template"] * (1 + 1e-12)}
+    assert load_body(write_npz(tmp_path / "c.npz", rounded)).source.checksum == one.source.checksum
+    for key in ("v_template", "shapedirs", "posedirs", "hands_meanl"):
+        other = {**arrays, key: arrays[key] + 1e-5}
+        found = load_body(write_npz(tmp_path / f"{key}.npz", other))
+        assert found.source.checksum != one.source.checksum
+
+
 @pytest.mark.parametrize(
     ("columns", "betas", "expression"), [(400, 300, 100), (20, 10, 10), (10, 10, 0)]
 )

@@ -9,7 +9,7 @@ import stat
 import numpy as np
 import pytest
 
-from xavatar_jax.files import atomic_folder, atomic_path, cache_dir, file_checksum, save_arrays
+from xavatar_jax.files import atomic_folder, atomic_path, cache_dir, save_arrays
 
 
 class Interrupted(BaseException):
@@ -123,10 +123,3 @@ def test_cache_folder(tmp_path, monkeypatch):
     assert cache_dir().is_dir()
     assert cache_dir(tmp_path / "mine") == tmp_path / "mine"
     assert (tmp_path / "mine").is_dir()
-
-
-def test_checksum_is_the_known_digest(tmp_path):
-    (tmp_path / "abc").write_bytes(b"abc")  # the example of the SHA-256 standard
-    assert file_checksum(tmp_path / "abc") == (
-        "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    )

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..kinematics import KinematicTree, matrix_to_axis_angle
+from .identity import body_checksum
 from .model import BodyModel, BodySource
 from .params import BodyParams
 from .parts import derive_part_labels
@@ -81,7 +81,7 @@ def body_from_model(
             path=f"body-models:{type(model).__name__}",
             kind="other",
             gender=str(getattr(model, "gender", "neutral")),
-            checksum=_digest(vertices, faces, weights, joints, tree),
+            checksum=body_checksum(tree, faces, vertices, weights, joints),
         ),
     )
 
@@ -254,17 +254,3 @@ def _check_rigid(
             f"the pose moves {joint} by {1e3 * worst.max():.1f} mm along its bone; an avatar is "
             "driven by rotations alone: leave out parameters that stretch bones"
         )
-
-
-def _digest(
-    vertices: np.ndarray,
-    faces: Int[np.ndarray, "F 3"],
-    weights: np.ndarray,
-    joints: np.ndarray,
-    tree: KinematicTree,
-) -> str:
-    digest = hashlib.sha256("/".join(tree.names).encode())
-    for value in (vertices, weights, joints):
-        digest.update(np.round(value, 6).astype(np.float32).tobytes())
-    digest.update(faces.tobytes())
-    return digest.hexdigest()

@@ -10,8 +10,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..files import cache_dir, file_checksum, load_npz, load_pickle
+from ..files import cache_dir, load_npz, load_pickle
 from ..kinematics import KinematicTree
+from .identity import body_checksum
 from .joints import SMPL_TREE, SMPLH_TREE, SMPLX_TREE, mano_tree, pose_groups
 from .model import BodyModel, BodySource
 from .parts import PARTS, derive_part_labels
@@ -122,9 +123,8 @@ def _build(
     regressor = _dense(data.get("J_regressor"))
     regressor = _array(file, {"J_regressor": regressor}, "J_regressor", (joints, vertices))
     posedirs = _array(file, data, "posedirs", (vertices, 3, 9 * (joints - 1)))
-    shape, expression = _split_shape(
-        _array(file, data, "shapedirs", (vertices, 3, None)), kind, num_betas, num_expression, file
-    )
+    shapedirs = _array(file, data, "shapedirs", (vertices, 3, None))
+    shape, expression = _split_shape(shapedirs, kind, num_betas, num_expression, file)
     mean, components = _hands(file, data, tree)
     labels = data.get("part_labels")
     if labels is None:
@@ -166,7 +166,9 @@ def _build(
             path=str(file.resolve()),
             kind=kind,
             gender=_gender(file, gender),
-            checksum=file_checksum(file),
+            checksum=body_checksum(
+                tree, faces, template, shapedirs, posedirs, regressor, weights, mean, labels
+            ),
         ),
     )
 

@@ -4,7 +4,6 @@ from .atomic import atomic_folder as atomic_folder
 from .atomic import atomic_path as atomic_path
 from .cache import cache_dir as cache_dir
 from .cache import cache_path as cache_path
-from .checksum import file_checksum as file_checksum
 from .trees import flatten_named as flatten_named
 from .trees import load_arrays as load_arrays
 from .trees import load_header as load_header

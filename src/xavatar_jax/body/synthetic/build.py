@@ -26,7 +26,7 @@ from .untangle import untangle
 from .weights import skinning_weights, surface_operators
 
 # Changes whenever the arrays change: caches are keyed by it.
-SYNTHETIC_BODY_VERSION = "4"
+SYNTHETIC_BODY_VERSION = "5"
 
 _NUM_SHAPE, _NUM_EXPRESSION = 300, 100
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from .field import bump
 from .shape import bone_directions
 from .skeleton import (
     FINGERS,
@@ -92,12 +93,12 @@ def pose_directions(
                 if offset[0] == 0.0:
                     ends = ends[:1]
                 for end in ends:
-                    q = (vertices - joints[joint] - np.asarray(offset) * end) / np.asarray(radii)
-                    height += size * _MM * np.exp(-0.5 * (q * q).sum(1))
+                    centre = joints[joint] + np.asarray(offset) * end
+                    height += size * _MM * bump(vertices, centre, radii)
             height = np.clip(height, -_MOST, _MOST)
             height[np.abs(height) < 0.02 * _MM] = 0.0
             touched = np.flatnonzero(height)
             swing = -np.outer(bones[joint], bones[joint]).ravel()
-            bump = height[touched, None] * normals[touched]
-            out[touched, :, joint - 1] = bump[:, :, None] * swing
+            push = height[touched, None] * normals[touched]
+            out[touched, :, joint - 1] = push[:, :, None] * swing
     return out.reshape(len(vertices), 3, 486)

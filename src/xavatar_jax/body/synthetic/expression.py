@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from .field import bump
 from .skeleton import JOINT_INDEX
 
 EXPRESSION_NAMES = (
@@ -95,8 +96,7 @@ def expression_directions(
                 if sign < 0.0 and side:
                     continue
                 flip = np.array([sign, 1.0, 1.0])
-                q = (vertices - np.asarray(centre) * flip) / np.asarray(radii)
-                fall = np.exp(-0.5 * (q * q).sum(1))
+                fall = bump(vertices, np.asarray(centre) * flip, radii)
                 if centre[0] == 0.0:
                     fall *= 0.5  # both mirror images coincide on the midline
                 out[:, :, e] += (mask * fall)[:, None] * (np.asarray(push) * flip * _MM)

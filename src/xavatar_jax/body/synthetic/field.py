@@ -23,6 +23,21 @@ def offset(point: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
     return point + np.array([x, y, z])
 
 
+def on_grid(p: Points) -> Points:
+    """Points moved to whole multiples of 2**-21 m, which float32 holds exactly.
+
+    The last bits of a power or an exponential differ from processor to processor, and a mesh that
+    is remeshed by comparisons of lengths would become another one.
+    """
+    return np.rint(p * 2.0**21) * 2.0**-21
+
+
+def bump(p: Points, centre: Vector, radii: Vector) -> Values:
+    """A Gaussian of height 1 with deviations `radii` along the axes."""
+    q = (p - np.asarray(centre)) / np.asarray(radii)
+    return np.exp(-0.5 * (q * q).sum(1))
+
+
 def smooth_min(a: Values, b: Values, radius: float) -> Values:
     """Union with a fillet of about `radius` (polynomial smooth minimum)."""
     blend = np.maximum(radius - np.abs(a - b), 0.0)

@@ -16,23 +16,17 @@ _RELAXED = {
 }
 
 
-def _length(vector: Float[np.ndarray, " n"]) -> np.floating:
-    # No product by BLAS here, whose last bits differ from processor to processor: what is stored of
-    # hands is float64, and the file's checksum, by which avatars know their body, has to be one.
-    return np.sqrt((vector * vector).sum())
-
-
 def flexion_axes(finger: str) -> Float[np.ndarray, "3 3"]:
     """Axes of the left finger's joints about which a positive angle flexes, unit."""
     chain = finger_chain(finger)
     axes = []
     for i in range(3):
         along = chain[i + 1] - chain[i]
-        along = along / _length(along)
+        along = along / np.linalg.norm(along)
         # The palm side of a finger is down; the thumb's looks backwards, across the palm.
         palm = np.array([0.0, -1.0, 0.0]) if finger != "thumb" else np.array([0.15, -0.55, -0.80])
         axis = np.cross(along, palm)
-        axes.append(axis / _length(axis))
+        axes.append(axis / np.linalg.norm(axis))
     return np.stack(axes)
 
 
@@ -41,7 +35,7 @@ def spread_axis(finger: str) -> Float[np.ndarray, " 3"]:
     chain = finger_chain(finger)
     along = chain[1] - chain[0]
     axis = np.cross(along, flexion_axes(finger)[0])
-    return -axis / _length(axis)
+    return -axis / np.linalg.norm(axis)
 
 
 def mirror_rotation(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
@@ -83,8 +77,8 @@ def hand_basis() -> Float[np.ndarray, "45 45"]:
         row = row.copy()
         for _ in range(2):
             for b in basis:
-                row -= b * (b * row).sum()
-        length = _length(row)
+                row -= b * (b @ row)
+        length = np.linalg.norm(row)
         if length > 1e-6 and len(basis) < 45:
             basis.append(row / length)
     return np.stack(basis)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
-from .field import Field
+from .field import Field, on_grid
 from .topology import bad_edges, split_fans
 
 _UNIT = 0.00075  # smallest leaf, metres
@@ -144,7 +144,7 @@ def _contour(
     leaf = np.flatnonzero(count)
     number = np.full(len(origin), -1)
     number[leaf] = np.arange(len(leaf))
-    vertices = total[leaf] / count[leaf, None]
+    vertices = on_grid(total[leaf] / count[leaf, None])
 
     quads = number[around]
     quads[~sign] = quads[~sign][:, ::-1]

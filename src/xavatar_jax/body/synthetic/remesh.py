@@ -10,25 +10,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .field import Field, gradient
+from .field import Field, gradient, on_grid
 from .topology import Edges, vertex_normals
 
 Target = Callable[[np.ndarray], np.ndarray]
 
 
-def project(
-    field: Field, v: np.ndarray, limit: np.ndarray, rounds: int = 2
-) -> tuple[np.ndarray, np.ndarray]:
-    """Newton steps to the zero level, each no longer than `limit`; also the unit gradients."""
-    normal = np.zeros_like(v)
+def project(field: Field, v: np.ndarray, limit: np.ndarray, rounds: int) -> np.ndarray:
+    """Newton steps to the zero level, each no longer than `limit`."""
     for _ in range(rounds):
         value, slope = gradient(field, v, 0.04 * limit + 1e-5)
         size = np.maximum((slope * slope).sum(1), 0.09)
         step = -value / size
         step = np.clip(step * np.sqrt(size), -limit, limit) / np.sqrt(size)
         v = v + step[:, None] * slope
-        normal = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-    return v, normal
+    return on_grid(v)
 
 
 def _independent(edges: Edges, wanted: np.ndarray, score: np.ndarray) -> np.ndarray:
@@ -201,7 +197,7 @@ def relax(
     move -= normal * (move * normal).sum(1, keepdims=True)
     length = np.linalg.norm(move, axis=1)
     move *= (np.minimum(length, 0.4 * wanted) / np.maximum(length, 1e-12))[:, None]
-    return project(field, v + strength * move, 0.3 * wanted, rounds=1)[0]
+    return project(field, v + strength * move, 0.3 * wanted, rounds=1)
 
 
 def remesh(
@@ -217,7 +213,7 @@ def remesh(
     No edge with both ends where `ceiling` applies stays longer than it.
     """
     rng = np.random.default_rng(0)
-    v, _ = project(field, v, 0.5 * target(v), rounds=2)
+    v = project(field, v, 0.5 * target(v), rounds=2)
     for round_ in range(rounds):
         for _ in range(40 if round_ == 0 else 4):
             wanted = target(v)
@@ -241,5 +237,5 @@ def remesh(
         if not count:
             break
         faces, _ = flip_edges(v, faces, ceiling(v))
-        v, _ = project(field, v, 0.1 * target(v), rounds=1)
+        v = project(field, v, 0.1 * target(v), rounds=1)
     return v, faces

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from .field import bump
 from .skeleton import (
     JOINT_INDEX,
     JOINT_NAMES,
@@ -95,22 +96,17 @@ def bone_directions(joints: np.ndarray) -> np.ndarray:
     return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
-def _bump(p: np.ndarray, centre: tuple, radii: tuple) -> np.ndarray:
-    q = (p - np.asarray(centre)) / np.asarray(radii)
-    return np.exp(-0.5 * (q * q).sum(1))
-
-
 def _local(name: str, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Bumps of the surface that no bone explains."""
     p = np.concatenate([np.abs(vertices[:, :1]), vertices[:, 1:]], 1)
     amount = np.zeros(len(p))
     if name == "weight":
-        amount += 0.008 * _bump(p, (0.0, -0.25, 0.06), (0.10, 0.09, 0.08))
+        amount += 0.008 * bump(p, (0.0, -0.25, 0.06), (0.10, 0.09, 0.08))
     if name == "chest_and_belly":
-        amount += 0.014 * _bump(p, (0.0, -0.24, 0.08), (0.11, 0.085, 0.07))
-        amount -= 0.008 * _bump(p, (0.075, 0.0, 0.09), (0.06, 0.06, 0.06))
+        amount += 0.014 * bump(p, (0.0, -0.24, 0.08), (0.11, 0.085, 0.07))
+        amount -= 0.008 * bump(p, (0.075, 0.0, 0.09), (0.06, 0.06, 0.06))
     if name == "hips":
-        amount += 0.007 * _bump(p, (0.08, -0.42, -0.09), (0.07, 0.07, 0.05))
+        amount += 0.007 * bump(p, (0.08, -0.42, -0.09), (0.07, 0.07, 0.05))
     return amount[:, None] * normals
 
 

@@ -95,13 +95,3 @@ def two_bone(
     upper_rotation = frame(upper, hinge) @ at_rest.T
     local = np.einsum("...ji,...j->...i", upper_rotation, lower)
     return TwoBone(upper_rotation, align(unit(lower_rest), local))
-
-
-def twist_angle(rotation: Rotations, axis: Float[np.ndarray, 3]) -> Float[np.ndarray, "*batch"]:
-    """Angle of the part of a rotation that turns about `axis`, the rest being a swing before it."""
-    from scipy.spatial.transform import Rotation
-
-    quaternion = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()
-    along = quaternion[:, :3] @ unit(np.asarray(axis, np.float64))
-    angle = 2 * np.arctan2(along, quaternion[:, 3])
-    return ((angle + np.pi) % (2 * np.pi) - np.pi).reshape(rotation.shape[:-2])
