@@ -36,6 +36,10 @@ def faults(folder: Path) -> list[str]:
     seconds = record.get("seconds", {})
     found += [f"seconds.{name} is not a number" for name in SECONDS if not _finite(seconds, name)]
     found += [f"no {name}" for name in OTHERS if name not in record]
+    if not found:
+        after, before = record["cd_mm"], record["before"]["cd_mm"]
+        worse = [region for region in REGIONS if after[region] >= before[region]]
+        found += [f"cd_mm.{region} is no better than before" for region in worse]
     return found
 
 

@@ -51,7 +51,7 @@ HOW = {
     f'{_VENV} ".[docs]" jupyterlab': _INSTALL,
     ".venv/bin/jupyter lab notebooks": skip("the notebooks' stage"),
     _FIT: skip("the example's stage"),
-    f"{_FIT} --minutes 0.5 --train-frames 24 --eval-frames 3 --out out/short": skip(
+    f"{_FIT} --steps 300 --train-frames 24 --eval-frames 3 --out out/short": skip(
         "the example's stage, with about these options"
     ),
     f"{_FIT} --out out/s1 --resume": skip("tests/training/test_checkpoint.py"),

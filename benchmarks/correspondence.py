@@ -60,7 +60,7 @@ from xavatar_jax.fields import (
     GridSpacing,
     TabulatedSkinning,
     body_part_grids,
-    mean_canonical_vertices,
+    grid_vertices,
     pose_grid,
     tabulate,
 )
@@ -547,7 +547,7 @@ def main() -> None:
     size = QUICK if args.quick else Size()
     steps = args.prefit_steps or size.prefit_steps
     body = xa.synthetic_body(args.cache_dir)
-    vertices = mean_canonical_vertices(body)
+    vertices = grid_vertices(body)
     mlp = paper_field(body, steps, cache=args.cache_dir)
     fields = tabulated(body, vertices, mlp, size.grid_mm)
     guides = tabulated(body, vertices, mlp, size.guide_mm)

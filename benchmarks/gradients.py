@@ -37,7 +37,7 @@ from xavatar_jax.correspondence import (
 from xavatar_jax.correspondence.implicit import MIN_DETERMINANT
 from xavatar_jax.fields import (
     AbstractSkinningField,
-    mean_canonical_vertices,
+    grid_vertices,
     skin_with_jacobian,
 )
 from xavatar_jax.kinematics import determinant_3x3, inverse_3x3, skin_points, solve_3x3
@@ -403,7 +403,7 @@ def main() -> None:
     field = paper_field(body, steps, cache=args.cache_dir)
     frames, count = (2, 60) if args.quick else (4, 600)
     problems = hard_problems(
-        body, field, mean_canonical_vertices(body),
+        body, field, grid_vertices(body),
         degrees=20.0, frames=frames, count=600, seed=args.seed,
     )  # fmt: skip
     names = ("implicit_root", "find_correspondences", "unrolled Newton", "unrolled Broyden")

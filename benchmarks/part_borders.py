@@ -26,7 +26,7 @@ import xavatar_jax as xa
 from xavatar_jax.body import BODY, EYES_MOUTH, FACE, LEFT_HAND, RIGHT_HAND
 from xavatar_jax.correspondence import RowFinder, search_grid, start_table
 from xavatar_jax.correspondence.nearby import NEAR
-from xavatar_jax.fields import mean_canonical_vertices, pose_grid
+from xavatar_jax.fields import grid_vertices, pose_grid
 from xavatar_jax.report import describe_machine
 
 BORDERS = {
@@ -58,7 +58,7 @@ def main() -> None:
     frames, count = (1, 300) if args.quick else (8, 3000)
     steps, grid_mm = (QUICK_PREFIT, (34, 8, 16)) if args.quick else (FULL_PREFIT, (16, 4, 8))
     body = xa.synthetic_body(args.cache_dir)
-    vertices, labels = mean_canonical_vertices(body), np.asarray(body.part_labels)
+    vertices, labels = grid_vertices(body), np.asarray(body.part_labels)
     mlp = paper_field(body, steps, cache=args.cache_dir)
     field = tabulated(body, vertices, mlp, grid_mm, 1).grid
     pairs, full = start_table(body.tree, pairs=True), start_table(body.tree, "full")

@@ -475,9 +475,11 @@ def medians_view(
             rows.append([*(f"{row[name]}" for name in shown), *_cells(row, columns)])
         header = record["header"]
         budget = f", {header['minutes']:g} minutes a run" if "minutes" in header else ""
+        commits = list(dict.fromkeys(row["commit"][:7] for row in record["rows"]))
+        made = f" Runs of commits {', '.join(commits)}." if len(commits) > 1 else ""
         return (
             f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['eval_frames']} held-out "
-            f"frames{budget}; medians over seeds."
+            f"frames{budget}; medians over seeds.{made}"
         )
 
     return view

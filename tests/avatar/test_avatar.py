@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import xavatar_jax as xa
 from xavatar_jax.avatar import CellSizes
 from xavatar_jax.body import SMPL_TREE, canonical_vertices
+from xavatar_jax.fields import grid_vertices
 from xavatar_jax.geometry import closest_points, winding_number
 from xavatar_jax.meshing import EmptyLevelSetError
 
@@ -24,6 +25,19 @@ def test_fit_learns_the_person(run):
     assert after.cd_mm.hands < 1.5
     assert after.iou.all > 0.95
     assert after.cd_mm.all < 0.5 * before.cd_mm.all
+    assert after.cd_mm.hands < 0.5 * before.cd_mm.hands
+    assert after.cd_mm.face < 0.8 * before.cd_mm.face
+
+
+def test_the_start_is_the_mean_shape(run):
+    """Before anything is learned the surface is that of no betas, not the person's."""
+    mesh = run.fit.before.canonical_mesh()
+    mean, own = (
+        np.median(closest_points(mesh.vertices, mesh.faces, grid_vertices(run.body, betas))[0])
+        for betas in (None, run.fit.avatar.betas)
+    )
+    assert mean < 0.003
+    assert own > 2 * mean
 
 
 def test_the_range_heard_is_that_of_the_frames_learned_from(run):
@@ -117,6 +131,24 @@ def test_occupancy_knows_inside_from_outside(run):
 def test_far_points_are_outside(run):
     far = jnp.asarray([[10.0, 0.0, 0.0], [0.0, -30.0, 2.0]])
     assert np.array_equal(run.fit.avatar.occupancy(far, run.test[0].params), [0.0, 0.0])
+
+
+def test_nothing_changes_far_from_the_origin(run):
+    """In a camera's space a person may stand anywhere; what float32 loses there is the points'."""
+    avatar, frame = run.fit.avatar, run.test[0]
+    points = jnp.asarray(frame.vertices[::400])
+    far = jnp.asarray([0.0, 0.0, 256.0])
+    moved = replace(frame.params, transl=frame.params.transl + far)
+    here, there = avatar.query(points, frame.params), avatar.query(points + far, moved)
+    assert np.asarray(there.found).all()
+    assert np.abs(np.asarray(here.x_c - there.x_c)).max() < 2e-4
+    by_point = jax.jacrev(lambda x: avatar.query(x, frame.params).logit.sum())(points)
+
+    def shifted(transl):
+        return avatar.query(points, replace(frame.params, transl=transl)).logit.sum()
+
+    by_transl = jax.grad(shifted)(frame.params.transl)
+    np.testing.assert_allclose(by_transl, -by_point.sum(0), rtol=1e-3, atol=1e-2)
 
 
 def test_occupancy_is_differentiable_in_points_and_pose(run):

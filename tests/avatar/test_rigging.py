@@ -177,6 +177,14 @@ def test_a_file_without_motion_stands_in_canonical_pose(run, tmp_path, capsys):
     np.testing.assert_allclose(turn, (0, 0, np.pi / 6), atol=1e-6)
 
 
+def test_a_clip_without_blend_shapes(run, motion, tmp_path):
+    report = run.fit.avatar.export_glb(
+        tmp_path / "a.glb", motion[:2], expressions=False, verbose=False
+    )
+    assert report.influence_loss is not None
+    assert validation_report(report.path)["issues"]["numErrors"] == 0
+
+
 def test_weights_file_is_the_avatar(run, tmp_path):
     avatar = run.fit.avatar
     avatar.export_weights(tmp_path / "w.npz")

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 import xavatar_jax as xa
+from xavatar_jax.avatar import Avatar
 from xavatar_jax.cli import fit
 from xavatar_jax.meshing import EmptyLevelSetError
 from xavatar_jax.training import TrainingError
@@ -66,6 +67,15 @@ def test_wrong_options(call, tmp_path, monkeypatch, bundled_body, words, complai
     code, _, error = call("fit", "--quiet", *words)
     assert code == 2
     assert complaint in error
+
+
+def test_models_of_the_environment_are_for_ones_own_data(call, tmp_path, monkeypatch):
+    monkeypatch.setenv("SMPLX_MODEL_DIR", str(tmp_path / "models"))
+    (tmp_path / "data").mkdir()
+    code, _, error = call("fit", "--quiet", "--data", tmp_path / "data")
+    assert code == 2
+    assert "no body model found" in error
+    assert str(tmp_path / "models") in error
 
 
 def test_help_of_the_config_is_apart(call):
@@ -142,6 +152,23 @@ def test_evaluate_prints_and_writes_the_same_figures(call, avatar_file, tmp_path
     row = next(line for line in said.splitlines() if line.startswith("Chamfer"))
     assert f"{record['cd_mm']['all']:.2f}" in row
     assert str(out) in said
+
+
+def test_evaluate_splits_as_the_avatar_was_learned(call, avatar_file, tmp_path, monkeypatch):
+    asked = []
+
+    def stop(data, body, **options):
+        asked.append((options["split_seed"], options["flat_hand_mean"]))
+        raise ValueError("enough")
+
+    body = xa.load_avatar(avatar_file).body
+    avatar = xa.load_avatar(avatar_file, body=body)
+    avatar = Avatar(body, avatar.betas, avatar.fields, replace(avatar.config, seed=5))
+    avatar.save(tmp_path / "five.npz")
+    monkeypatch.setattr(xa, "load_data", stop)
+    for more in ((), ("--seed", 2, "--flat-hand-mean", "False")):
+        call("evaluate", tmp_path / "five.npz", "--data", tmp_path, *more)
+    assert asked == [(5, None), (2, False)]
 
 
 def test_evaluate_looks_at_its_input_first(call, avatar_file, motion_file, tmp_path):

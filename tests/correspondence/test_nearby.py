@@ -24,6 +24,14 @@ def test_rows_are_of_the_nearest_part_and_of_another_close_by(rng):
     assert 10 < both < 190
 
 
+def test_eyes_and_mouth_take_no_place_beside_the_face():
+    """A fingertip at the cheek: the hand is the second part, though the lips are nearer."""
+    body, face, left, _, lips = range(len(PARTS))
+    vertices = np.array([[0.0, 0, 0], [0.005, 0, 0], [0.01, 0, 0], [0.5, 0, 0]])
+    finder = RowFinder(vertices, np.array([face, lips, left, body]))
+    assert finder(np.array([[0.0, 0, 0.001]])).tolist() == [PAIR_ROWS[face, left]]
+
+
 def test_points_that_are_not_finite_get_some_row():
     finder = RowFinder(np.eye(3), np.array([0, 1, 2]))
     rows = finder(np.array([[np.nan, 0, 0], [0, 0, 1.0]]))

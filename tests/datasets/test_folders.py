@@ -164,6 +164,17 @@ def test_relative_hands_by_argument_or_by_file(toy_body, tmp_path):
     np.testing.assert_allclose(hands[1] - hands[0], mean, atol=1e-6)
     with pytest.warns(CaptureNotice, match="is the mean hand added twice, or missing"):
         load_frames(tmp_path / "f", toy_body, flat_hand_mean=False)
+    with pytest.warns(CaptureNotice, match="is the mean hand added twice, or missing"):
+        capture = load_data(tmp_path / "f", toy_body, flat_hand_mean=False)
+    hands = np.concatenate([c.params.left_hand_pose for c in (capture.train, capture.test)])
+    np.testing.assert_allclose(
+        hands[0].reshape(-1), values["left_hand_pose"] + mean.ravel(), atol=1e-6
+    )
+
+
+def test_a_layout_that_knows_its_hands_is_not_told(prepared, toy_body):
+    with pytest.raises(ValueError, match="hands are relative to the mean hand in this layout"):
+        load_data(prepared, toy_body, flat_hand_mean=True)
 
 
 def test_train_and_test_subfolders_make_the_split(toy_body, tmp_path):

@@ -24,7 +24,7 @@ from xavatar_jax.fields import (
     GridSpacing,
     HashGeometry,
     body_part_grids,
-    mean_canonical_vertices,
+    grid_vertices,
     template_expression,
     template_grid_skinning,
     template_weights,
@@ -35,7 +35,7 @@ COARSE = GridSpacing(body=0.04, hands=0.013, face=0.02, band=0.08, fine_band=0.0
 
 @pytest.fixture(scope="module")
 def vertices(bundled_body):
-    return mean_canonical_vertices(bundled_body)
+    return grid_vertices(bundled_body)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +48,15 @@ def test_weights_at_the_vertices_are_their_own(bundled_body, vertices, rng):
     found = template_weights(bundled_body, vertices, vertices[pick])
     np.testing.assert_allclose(found, bundled_body.weights[pick], atol=1e-4)
     np.testing.assert_allclose(found.sum(1), 1.0, atol=1e-5)
+
+
+def test_grids_are_laid_in_float64(bundled_body, vertices):
+    """Cells are the same on every machine only if no float32 decides which are taken."""
+    posed = np.asarray(pose_body(bundled_body, canonical_params(bundled_body)).vertices)
+    assert vertices.dtype == np.float64
+    assert (vertices != vertices.astype(np.float32)).mean() > 0.8  # arms stay where they are
+    np.testing.assert_allclose(vertices, posed, atol=1e-6)
+    assert jnp.asarray(0.5).dtype == np.float32  # for this alone
 
 
 def test_weights_off_the_surface_are_those_of_the_nearest(bundled_body, vertices, rng):

@@ -12,7 +12,7 @@ import pytest
 
 import xavatar_jax as xa
 from xavatar_jax.body import FACES, canonical_vertices
-from xavatar_jax.fields import MLPShape, mean_canonical_vertices, template_expression
+from xavatar_jax.fields import MLPShape, grid_vertices, template_expression
 from xavatar_jax.training import fresh_fields
 
 
@@ -57,7 +57,7 @@ def test_fixed_points_give_the_field(bundled_body, kind, rng):
 def test_fixed_points_follow_the_expression(bundled_body, rng):
     """Where they are carried, the field is what it would be in place if nothing moved."""
     still = random_geometry(bundled_body, "hash")
-    vertices = mean_canonical_vertices(bundled_body)
+    vertices = grid_vertices(bundled_body)
     moves = template_expression(bundled_body, vertices, 0.01, 10)
     assert moves is not None
     geometry = eqx.tree_at(lambda g: g.moves, still, moves, is_leaf=lambda x: x is None)

@@ -12,9 +12,11 @@ import writers
 from helpers import COLUMNS, PARENTS, reference_body, toy_arrays
 from scipy.spatial.transform import Rotation
 
+from xavatar_jax.baselines import body_only
 from xavatar_jax.body import SMPLX_TREE, BodyParams, hands_to_relative
 from xavatar_jax.files import UnsafePickleError
 from xavatar_jax.motion import FORMATS, Motion, MotionNotice, load_motion, save_motion
+from xavatar_jax.motion.values import doubled_mean_notice
 
 CAMERA = np.diag([1.0, -1.0, -1.0])  # OpenCV's axes to y-up ones
 
@@ -163,6 +165,10 @@ def test_a_hand_with_the_mean_added_twice_is_noticed(tmp_path, body):
     read(folder, "left hand is nearer to twice the mean hand", body=body)
     motion = read(writers.xhumans(tmp_path / "b", numbers), body=body)
     assert not any("twice" in notice for notice in motion.notices)
+    # A body without fingers has no mean hand to be near to.
+    pose = 2 * np.asarray(body.hand_mean)[None, 25:40]
+    assert doubled_mean_notice(pose, body, "left") is not None
+    assert doubled_mean_notice(pose, body_only(body), "left") is None
 
 
 # Parameters by name in one file
@@ -645,6 +651,15 @@ def test_losses_of_amass_archives_are_said(tmp_path):
         assert data["gender"] == "neutral"
         assert data["fps"] == 25.0
         np.testing.assert_array_equal(data["betas"], 0)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "poses"])
+def test_shapes_of_another_model_are_not_passed_on(tmp_path, body, name):
+    with pytest.warns(MotionNotice) as caught:
+        path = save_motion(tmp_path / name, some_motion(model="smplh"), body=body)
+    said = " ".join(str(w.message) for w in caught)
+    assert "betas are of smplh and mean nothing to the smplx body" in said
+    assert not read(path, body=body).betas.any()
 
 
 def test_a_pose_for_blender(tmp_path, body):

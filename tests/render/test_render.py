@@ -248,6 +248,21 @@ def test_files_are_read_back(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.webp", "p.png"]
 
 
+@pytest.mark.parametrize(("name", "fps"), [("gif", 30), ("gif", 48), ("webp", 30)])
+def test_animations_keep_time(tmp_path, name, fps):
+    """Formats count in hundredths or thousandths of a second."""
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (8, 8, 3), np.uint8) for _ in range(2 * fps)]
+    getattr(render, f"save_{name}_animation")(frames, tmp_path / f"a.{name}", fps=fps)
+    with Image.open(tmp_path / f"a.{name}") as animation:
+        total = 0
+        for k in range(animation.n_frames):
+            animation.seek(k)
+            animation.load()
+            total += animation.info["duration"]
+    assert total == pytest.approx(2000, abs=10)
+
+
 def test_bad_pictures_are_refused_and_leave_no_file(tmp_path):
     with pytest.raises(ValueError, match="uint8"):
         render.save_png(tmp_path / "p.png", np.zeros((4, 4, 3)))
@@ -256,6 +271,8 @@ def test_bad_pictures_are_refused_and_leave_no_file(tmp_path):
     frames = [np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)]
     with pytest.raises(ValueError, match="differ in shape"):
         render.save_webp_animation(frames, tmp_path / "a.webp")
+    with pytest.raises(ValueError, match="60 frames a second are more than a GIF can hold: 50"):
+        render.save_gif_animation(frames[:1], tmp_path / "a.gif", fps=60)
     with pytest.raises(ValueError, match="no shading 'shiny'"):
         render.render_mesh(sphere(), front_camera(), 8, shading="shiny")
     assert list(tmp_path.iterdir()) == []

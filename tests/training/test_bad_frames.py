@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import warnings
 import weakref
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from small_runs import posed_frames, tiny
 import xavatar_jax as xa
 from xavatar_jax.geometry import winding_number
 from xavatar_jax.training import TrainingNotice, choose_frames, loop
-from xavatar_jax.training.check import FrameCheck, check_found
+from xavatar_jax.training.check import FrameCheck, check_expression, check_found
 from xavatar_jax.training.pool import label_frames
 from xavatar_jax.training.progress import progress
 
@@ -214,6 +215,18 @@ def test_frames_that_are_all_far_from_their_parameters_are_refused(case, no_pref
         pytest.raises(ValueError, match=r"no point of any frame.*scan_0, scan_1, scan_2.*units"),
     ):
         xa.fit(moved, config, body=body, verbose=False)
+
+
+def test_expression_that_no_field_reads_is_said(case):
+    params = case[1].params
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_expression(params, None)
+        check_expression(replace(params, expression=np.zeros((3, 50))), None)
+    more = np.zeros((3, 50))
+    more[1, 12] = -2.5
+    with pytest.warns(TrainingNotice, match=r"50 coefficients.*first 10.*reach 2\.5"):
+        check_expression(replace(params, expression=more), None)
 
 
 def test_points_beyond_the_grids_are_counted(case):

@@ -114,11 +114,12 @@ def test_held_frames_are_not_learned_from(case, judged):
     last = {}
     train_pool(
         body, fields, other, np.zeros(10), config, held=1, verbose=False,
-        callback=lambda step, fields, terms: last.update(fields=fields),
+        callback=lambda step, fields, terms: last.update(fields=fields, terms=terms),
     )  # fmt: skip
     expected = judged[1][12][0]
     for a, b in zip(jax.tree.leaves(last["fields"]), jax.tree.leaves(expected), strict=True):
         assert np.array_equal(a, b)
+    assert last["terms"]["validation"] > 1.5 * judged[1][12][1]["validation"]
 
 
 def test_validation_is_the_loss_of_the_fields_at_their_roots(case, judged):

@@ -12,4 +12,5 @@ from .query import Query as Query
 from .rigging import GlbExport as GlbExport
 from .store import load_avatar as load_avatar
 from .store import load_avatar_body as load_avatar_body
+from .store import load_avatar_config as load_avatar_config
 from .surface import CellSizes as CellSizes

@@ -13,6 +13,7 @@ from ..correspondence import StartSet, implicit_root, search_grid, start_table
 from ..fields import TabulatedSkinning, pose_grid
 from ..training import AvatarFields
 from ..training.objective import best_root
+from ..training.pool import centred
 
 
 class Query(NamedTuple):
@@ -44,6 +45,8 @@ def query_posed(
     Derivatives, with respect to points, pose and fields, pass the chosen root by the implicit
     function theorem.
     """
+    # Near the origin: float32 has a micrometre there, but not in a room or a camera's space.
+    points, params = points - params.transl, centred(params)
     transforms = bone_transforms(body, params)
     condition = fields.geometry.condition(params)
     fixed_points, fixed_transforms, fixed_table = jax.lax.stop_gradient((points, transforms, table))

@@ -245,7 +245,7 @@ def measure_losses(
         return None, None, 0
     few = jnp.asarray(limit_influences(rig.weights, influences).dense(rig.tree.num_joints).T)
     every = jnp.asarray(rig.weights.T)
-    shapes = rig.targets.reshape(len(rig.targets), -1)
+    shapes = rig.targets.reshape(len(rig.targets), 3 * rig.mesh.num_vertices)
     by_influence, in_all = [], []
     for animation, clip in pairs:
         for k in spread_frames(len(animation), max(_CHECKED_FRAMES // len(pairs), 1)):

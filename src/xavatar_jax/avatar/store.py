@@ -22,6 +22,7 @@ from ..files import (
 )
 from ..training import (
     AvatarFields,
+    FitConfig,
     config_from_dict,
     config_to_dict,
     fresh_fields,
@@ -111,6 +112,16 @@ def load_avatar_body(
     header = load_header(path)
     check_header(path, header)
     return _find_body(path, header["body"], file)
+
+
+def load_avatar_config(path: str | os.PathLike[str]) -> FitConfig:
+    """The config of the run that an avatar file comes from.
+
+    **Raises:** `ValueError` for a file that is none of an avatar.
+    """
+    header = load_header(path)
+    check_header(path, header)
+    return config_from_dict(header["config"])
 
 
 def check_header(path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 import xavatar_jax as xa
 
 from .inputs import count_of, read_avatar_body, read_capture
-from .options import File, Flag, Folder, Gender, Target, Words, arg
+from .options import Count, File, Flag, Folder, Gender, Target, Truth, Words, arg
 from .outputs import check_file, written
 
 
@@ -31,6 +31,8 @@ class Options:
     """A capture; without it the bundled one."""
     test: Words = ()
     """Its sequences to evaluate on, where it is not split already."""
+    flat_hand_mean: Truth = None
+    """Of meshes with parameters beside them. False: their hands are relative to the mean hand."""
     eval_frames: Annotated[str, arg(metavar="N|all")] = "24"
     """Held-out frames to evaluate, spread over the sequences."""
     mode: Literal["fast", "full"] = "fast"
@@ -39,26 +41,31 @@ class Options:
     """The body model, if it is not where the avatar was learned ("bundled": our own)."""
     gender: Gender = None
     """In place of the gender that the data name."""
-    seed: Annotated[int, arg(metavar="N")] = 0
-    """Of the points that are compared, and of the split."""
+    seed: Count = None
+    """Of the points that are compared, and of the split; without it that of the avatar's run."""
     quiet: Flag = False
     """No progress bars, no table."""
 
 
 def run(options: Options) -> None:
     """Evaluate, write the figures, print the table."""
+    from ..avatar import load_avatar_config
     from ..report import metrics_record, metrics_table, write_json
 
     started = time.perf_counter()
     count = count_of(options.eval_frames)
     check_file(options.out)
+    seed = options.seed
+    if seed is None:
+        seed = load_avatar_config(options.avatar).seed
     body = read_avatar_body(options.avatar, options.body)
     capture = read_capture(
         options.data,
         body,
         gender=options.gender,
         test=options.test,
-        seed=options.seed,
+        seed=seed,
+        flat_hand_mean=options.flat_hand_mean,
         verbose=not options.quiet,
     )
     # A capture may have the person's own template: then that is the body that was learned on.
@@ -68,7 +75,7 @@ def run(options: Options) -> None:
         capture.test,
         num_frames=count,
         mode=options.mode,
-        seed=options.seed,
+        seed=seed,
         verbose=not options.quiet,
     )
     seconds = {"total": time.perf_counter() - started}

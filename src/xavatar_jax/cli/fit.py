@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
@@ -14,7 +15,7 @@ import xavatar_jax as xa
 
 from . import options as shared
 from .inputs import count_of, read_body, read_capture
-from .options import Count, File, Flag, Folder, Gender, Number, Target, Words
+from .options import Count, File, Flag, Folder, Gender, Number, Target, Truth, Words
 from .outputs import check_folder
 
 if TYPE_CHECKING:
@@ -63,8 +64,10 @@ class Options:
     """A capture; without it the bundled one."""
     test: Words = ()
     """Sequences to hold out, where the data are not split already."""
+    flat_hand_mean: Truth = None
+    """Of meshes with parameters beside them. False: their hands are relative to the mean hand."""
     model_dir: Folder = None
-    """Body models, in the layout of smplx.create."""
+    """Body models, in the layout of smplx.create. With --data also SMPLX_MODEL_DIR is looked at."""
     body: File = None
     """One body model file."""
     gender: Gender = None
@@ -137,11 +140,14 @@ def load(options: Options) -> Capture:
     from ..datasets import find_gender
 
     verbose = not options.quiet
+    models = options.model_dir
+    if models is None and options.data is not None and "SMPLX_MODEL_DIR" in os.environ:
+        models = Path(os.environ["SMPLX_MODEL_DIR"])
     if options.body is not None:
         body = read_body(options.body, options.gender)
-    elif options.model_dir is not None:
+    elif models is not None:
         gender = options.gender or (find_gender(options.data) if options.data else None)
-        body = read_body(options.model_dir, gender)
+        body = read_body(models, gender)
     else:
         if verbose:
             print("bundled body (made on first use, about a minute) ...", flush=True)
@@ -152,6 +158,7 @@ def load(options: Options) -> Capture:
         gender=options.gender,
         test=options.test,
         seed=options.seed,
+        flat_hand_mean=options.flat_hand_mean,
         cache=options.cache_dir,
         verbose=verbose,
     )

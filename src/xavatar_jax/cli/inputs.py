@@ -91,6 +91,7 @@ def read_capture(
     gender: str | None = None,
     test: tuple[str, ...] = (),
     seed: int = 0,
+    flat_hand_mean: bool | None = None,
     cache: Path | None = None,
     verbose: bool = False,
 ) -> Capture:
@@ -98,7 +99,13 @@ def read_capture(
     if data is None:
         return xa.synthetic_capture(cache, body=body, verbose=verbose)
     return xa.load_data(
-        data, body, gender=gender, test=test or None, split_seed=seed, verbose=verbose
+        data,
+        body,
+        gender=gender,
+        test=test or None,
+        split_seed=seed,
+        flat_hand_mean=flat_hand_mean,
+        verbose=verbose,
     )
 
 

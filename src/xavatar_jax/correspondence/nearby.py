@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..body import PARTS
+from ..body import EYES_MOUTH, FACE, PARTS
 from .starts import PAIR_ROWS
 
 # A point this close to two parts, in metres, may belong to either, or to both where they touch.
@@ -34,7 +34,8 @@ class RowFinder:
         # Unbalanced, uncompacted trees build faster and answer as fast on surfaces.
         options: dict[str, Any] = {"balanced_tree": False, "compact_nodes": False}
         self._all = cKDTree(vertices, **options)
-        self._labels = np.asarray(labels)
+        # Eyes and mouth start as the face does: they are no second part beside it.
+        self._labels = np.where(labels == EYES_MOUTH, FACE, labels)
         self._parts = [
             cKDTree(vertices[self._labels == part], **options) for part in range(len(PARTS))
         ]

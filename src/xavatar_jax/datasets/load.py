@@ -30,6 +30,7 @@ def load_data(
     gender: str | None = None,
     test: Sequence[str] | None = None,
     split_seed: int = 0,
+    flat_hand_mean: bool | None = None,
     verbose: bool = False,
 ) -> Capture:
     """Load a capture in whichever known layout `data_dir` has.
@@ -40,24 +41,32 @@ def load_data(
         gender: takes the place of what the files say.
         test: names of sequences to hold out, where the folder is not split.
         split_seed: chooses them otherwise.
+        flat_hand_mean: of meshes with parameters beside them, as `load_frames` takes it (absolute
+            unless given). The other layouts know what their hands are.
         verbose: show a progress bar.
 
     Raises:
         FileNotFoundError: no such folder, or no known layout in it; lists the layouts looked for
             and what is there.
-        ValueError: as the loader of the layout.
+        ValueError: as the loader of the layout; `flat_hand_mean` for a layout that knows.
     """
     data_dir = Path(data_dir)
     if not data_dir.is_dir():
         raise FileNotFoundError(f"No data folder at {data_dir}.")
     options: dict[str, Any] = {"gender": gender, "test": test, "verbose": verbose}
-    if find_motions(data_dir):
+    motions, subject = find_motions(data_dir), find_subject(data_dir)
+    if (motions or subject is not None) and flat_hand_mean is not None:
+        raise ValueError(
+            f"{data_dir}: hands are {'absolute' if motions else 'relative to the mean hand'} in "
+            "this layout; leave out flat_hand_mean"
+        )
+    if motions:
         return load_grab(data_dir, body, split_seed=split_seed, **options)
-    subject = find_subject(data_dir)
     if subject is not None:
         return load_prepared(subject, body, **options)
     if find_frames(data_dir):
-        return load_folder(data_dir, body, split_seed=split_seed, **options)
+        flat = flat_hand_mean is not False
+        return load_folder(data_dir, body, split_seed=split_seed, flat_hand_mean=flat, **options)
     raise FileNotFoundError(_unknown_layout(data_dir))
 
 

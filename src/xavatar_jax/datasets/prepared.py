@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ..body import BodyModel
-from ..motion.values import read_gender
+from ..motion.values import read_gender, read_mean_shape
 from .capture import Capture, notify, resolve_gender
 from .mesh_frames import check_first_frame, mesh_frames, read_params
 
 _PATTERN = "*/SMPLX/mesh-f*_smplx.pkl"
 _MESH_PATTERN = "*/SMPLX/mesh-f*_smplx.ply"
-_NUM_BETAS = 10  # the meshes are made with ten, whatever the file of the mean shape holds
 
 
 def find_subject(data_dir: Path) -> Path | None:
@@ -78,9 +75,7 @@ def load_prepared(
     pairs = {part: _pairs(subject_dir / part) for part in ("train", "test")}
     both = [*pairs["train"], *pairs["test"]]
     shape_file, gender_file = subject_dir / "mean_shape_smplx.npy", subject_dir / "gender.txt"
-    shape = None
-    if shape_file.is_file():
-        shape = np.load(shape_file, allow_pickle=False).reshape(-1)[:_NUM_BETAS].astype(np.float64)
+    shape = read_mean_shape(shape_file) if shape_file.is_file() else None
     found = {str(gender_file): read_gender(gender_file)} if gender_file.is_file() else {}
     subject_gender, notices = resolve_gender(found, body, gender, subject_dir)
     params, betas, more = read_params(

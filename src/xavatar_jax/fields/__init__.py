@@ -28,7 +28,7 @@ from .skinning import pose_grid as pose_grid
 from .skinning import skin_with_jacobian as skin_with_jacobian
 from .skinning import tabulate as tabulate
 from .template import body_part_grids as body_part_grids
-from .template import mean_canonical_vertices as mean_canonical_vertices
+from .template import grid_vertices as grid_vertices
 from .template import random_grid_skinning as random_grid_skinning
 from .template import template_expression as template_expression
 from .template import template_grid_skinning as template_grid_skinning

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..body import (
     FACES,
@@ -28,9 +28,25 @@ from .skinning import GridSkinning
 _FACE_MARGIN = 0.04
 
 
-def mean_canonical_vertices(body: BodyModel) -> Float[np.ndarray, "V 3"]:
-    """The mean shape in the canonical pose, metres."""
-    return np.asarray(canonical_vertices(body, jnp.zeros(0, body.template.dtype)), np.float64)
+def grid_vertices(
+    body: BodyModel, betas: Float[Array | np.ndarray, " S"] | None = None
+) -> Float[np.ndarray, "V 3"]:
+    """A shape, the mean one unless given, in the canonical pose, metres.
+
+    In float64: grids are laid around it, and a learned array fits them on another machine only if
+    not one cell is decided by a rounding.
+    """
+    with jax.enable_x64(True):
+        betas = jnp.zeros(0) if betas is None else jnp.asarray(np.asarray(betas, np.float64))
+        return np.asarray(_in_float64(body, betas))
+
+
+@eqx.filter_jit
+def _in_float64(body: BodyModel, betas: Float[Array, " S"]) -> Float[Array, "V 3"]:
+    wide = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float64) if eqx.is_inexact_array(leaf) else leaf, body
+    )
+    return canonical_vertices(wide, betas)
 
 
 def body_part_grids(

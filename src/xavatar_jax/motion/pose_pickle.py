@@ -10,7 +10,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..files import atomic_folder, atomic_path
-from .convert import MotionNotice
+from .convert import MotionNotice, shape_for
 from .record import Motion
 from .values import grouped_poses
 
@@ -68,7 +68,9 @@ def _frames(motion: Motion, body: BodyModel) -> tuple[list[dict[str, np.ndarray]
     poses, notices = grouped_poses(motion, body)
     notices.append(f"{motion.source}: pose pickles hold no frame rate ({motion.fps:g} a second).")
     parts = {"transl": motion.transl, "expression": np.asarray(motion.expression), **poses}
-    parts["betas"] = np.broadcast_to(motion.betas, (len(motion), len(motion.betas)))
+    betas, notice = shape_for(motion, body)
+    notices += [] if notice is None else [notice]
+    parts["betas"] = np.broadcast_to(betas, (len(motion), len(betas)))
     frames = [
         {name: np.ascontiguousarray(values[[k]]) for name, values in parts.items()}
         for k in range(len(motion))

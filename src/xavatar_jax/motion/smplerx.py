@@ -30,12 +30,12 @@ def _recognise(source: Source) -> bool:
 def _read(source: Source, options: ReadOptions) -> Motion:
     up = options.turned(str(source.path))
     files = numbered(source, _PATTERN, ("smplx",))
+    # Numbers count the people of one frame: a person alone in it is the same as another.
+    alone = options.person is None and all(len(found) == 1 for found in files.values())
     people: dict[int, dict[int, Path]] = {}
     for number, paths in files.items():
         for path in paths:
-            # Numbers count the people of one frame: a person alone in it is the same as another.
             match = re.fullmatch(_PATTERN, path.name)
-            alone = options.person is None and all(len(found) == 1 for found in files.values())
             person = 0 if alone or match is None else int(match[2] or 0)
             people.setdefault(person, {})[number] = path
     counts = {person: len(found) for person, found in people.items()}

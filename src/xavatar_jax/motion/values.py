@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Side = Literal["left", "right"]
 # Rotation matrices in files are rounded to float32 or half, networks' are not quite orthogonal.
 _ORTHOGONAL = 1e-2
+_NUM_BETAS = 10  # of X-Humans
 
 
 def rotation_vectors(
@@ -183,7 +184,7 @@ def doubled_mean_notice(
 
     That is how a file looks whose hands were absolute already when the mean was added.
     """
-    if body is None:
+    if body is None or len(pose_groups(body.tree)[f"{side}_hand_pose"]) != 15:
         return None
     mean, found = _hand_mean(body, side), pose.mean(axis=0)
     twice, once = np.linalg.norm(found - 2 * mean), np.linalg.norm(found - mean)
@@ -257,6 +258,15 @@ def text(value: Any) -> str:
 def listing(keys: Any) -> str:
     """Names of entries, for messages."""
     return ", ".join(sorted(map(str, keys))) or "nothing"
+
+
+def read_mean_shape(file: Path) -> Float[np.ndarray, " S"]:
+    """The shape in a `mean_shape_smplx.npy`: meshes are made with its first ten coefficients."""
+    try:
+        shape = np.load(file, allow_pickle=False).reshape(-1)
+    except ValueError as error:
+        raise ValueError(f"{file}: not a readable array of shape coefficients ({error}).") from None
+    return shape[:_NUM_BETAS].astype(np.float64)
 
 
 def read_gender(file: Path) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..files import atomic_path
-from .convert import MotionNotice, fit_size
+from .convert import MotionNotice, fit_size, shape_for
 from .format import Format, ReadOptions, Source
 from .params import read_frames, to_motion
 from .record import Motion
@@ -73,7 +73,9 @@ def save_xavatar(path: str | Path, motion: Motion, body: BodyModel) -> Path:
         )
     poses, notices = grouped_poses(motion, body)
     parts = {"scale": np.ones((len(motion), 1)), "transl": motion.transl, **poses}
-    betas = np.broadcast_to(motion.betas, (len(motion), len(motion.betas)))
+    shape, notice = shape_for(motion, body)
+    notices += [] if notice is None else [notice]
+    betas = np.broadcast_to(shape, (len(motion), len(shape)))
     for name, values in (("betas", betas), ("expression", np.asarray(motion.expression))):
         parts[name], notice = fit_size(values, _COEFFICIENTS, name, motion.source, "the format")
         notices += [] if notice is None else [notice]

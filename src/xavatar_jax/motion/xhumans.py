@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from .format import Format, ReadOptions, Source
 from .params import numbered, read_files, to_motion
 from .record import Motion
 from .resampling import fill_gaps
-from .values import read_gender
+from .values import read_gender, read_mean_shape
 
 _PATTERN = r"mesh-f(\d+)_smplx\.pkl"
 
@@ -38,17 +36,10 @@ def _read(source: Source, options: ReadOptions) -> Motion:
         options,
         notices,
         up=options.up or "y",
-        betas=None if shape is None else _mean_shape(shape),
+        betas=None if shape is None else read_mean_shape(shape),
         gender="unknown" if gender is None else read_gender(gender),
     )
     return fill_gaps(motion, list(files))
-
-
-def _mean_shape(path: Path) -> np.ndarray:
-    try:
-        return np.load(path, allow_pickle=False).reshape(-1).astype(np.float64)
-    except ValueError as error:
-        raise ValueError(f"{path}: not a readable array of shape coefficients ({error}).") from None
 
 
 def _first(folders: list[Path], name: str) -> Path | None:

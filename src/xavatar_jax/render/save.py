@@ -33,7 +33,8 @@ def save_webp_animation(
 
     Raises:
         OSError: if the file cannot be written.
-        ValueError: if there are no frames, they differ in shape, or `fps` is not positive.
+        ValueError: if there are no frames, they differ in shape, or `fps` is not positive or above
+            500.
     """
     _save_animation(frames, path, fps, "WEBP", quality=quality, method=2)
 
@@ -47,7 +48,8 @@ def save_gif_animation(
 
     Raises:
         OSError: if the file cannot be written.
-        ValueError: if there are no frames, they differ in shape, or `fps` is not positive.
+        ValueError: if there are no frames, they differ in shape, or `fps` is not positive or above
+            50.
     """
     _save_animation(frames, path, fps, "GIF")
 
@@ -63,11 +65,18 @@ def _save_animation(
 
     if not fps > 0:
         raise ValueError(f"fps must be positive, found {fps}.")
+    unit = 10 if format == "GIF" else 1
+    if fps > 500 / unit:
+        raise ValueError(
+            f"{fps:g} frames a second are more than a {format} can hold: {500 // unit} at most."
+        )
     images = [_checked(frame) for frame in frames]
     if not images:
         raise ValueError("an animation needs at least one frame.")
     if len({image.shape for image in images}) > 1:
         raise ValueError(f"frames differ in shape: {sorted({i.shape for i in images})}.")
+    # Whole units of the format, whose sum keeps time.
+    ends = unit * np.round(np.arange(len(images) + 1) * (1000 / fps / unit)).astype(int)
     first, *rest = [Image.fromarray(image) for image in images]
     with atomic_path(path) as temporary:
         first.save(
@@ -75,7 +84,7 @@ def _save_animation(
             format=format,
             save_all=True,
             append_images=rest,
-            duration=max(1, round(1000.0 / fps)),
+            duration=np.diff(ends).tolist(),
             loop=0,
             **options,
         )

@@ -82,7 +82,9 @@ def _version(package: str) -> str | None:
 
 def _commit() -> str | None:
     """The commit of the source tree, or None outside of one."""
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve().parents[3]
+    if not (here / ".git").exists():  # installed: a repository around it is another's
+        return None
     try:
         done = subprocess.run(
             ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"],

@@ -101,7 +101,7 @@ def motion_pictures(
     where the person looks in the first frame; `shading` as for `render_mesh`. y is up.
     """
     width, height = (size, size) if isinstance(size, int) else size
-    reach = _reach(animation.avatar, animation.params)
+    reach = _reach(animation.avatar, animation.params, count=100)
     forward = tuple(facing(animation.params[0]))
     camera = frame_view(reach, view, forward=forward, aspect=width / height)
     floor = float(reach[:, 1].min())

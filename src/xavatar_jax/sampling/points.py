@@ -107,7 +107,8 @@ def sample_frame(
         points.append(drawn + spread * rng.standard_normal((count, 3)))
         parts.append(place_labels[place])
     if plan.box:
-        low, high = vertices.min(0) - plan.box_margin, vertices.max(0) + plan.box_margin
+        used = vertices[surface]
+        low, high = used.min(0) - plan.box_margin, used.max(0) + plan.box_margin
         points.append(rng.uniform(low, high, (plan.box, 3)))
         parts.append(np.full(plan.box, BODY))
     all_points = np.concatenate(points)

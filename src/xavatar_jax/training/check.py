@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Int
 
-from ..body import BodyModel
+from ..body import BodyModel, BodyParams
+from ..body.params import MAX_DEFAULT_COEFFICIENTS
 from ..frames import Frame, Frames, posed_vertices
 from ..geometry import nearest_vertices
 
@@ -76,6 +77,19 @@ def misfit(body: BodyModel, frame: Frame) -> float:
     chosen = posed[:: max(len(posed) // _LOOKED_AT, 1)]
     distance, _ = nearest_vertices(frame.vertices, chosen)
     return float(np.median(distance))
+
+
+def check_expression(params: BodyParams, record: list[str] | None) -> None:
+    """**Warns:** `TrainingNotice` if coefficients are used that no field of ours reads."""
+    beyond = np.abs(np.asarray(params.expression)[..., MAX_DEFAULT_COEFFICIENTS:])
+    if beyond.any():
+        notify(
+            f"expression has {params.expression.shape[-1]} coefficients, and the avatar learns the "
+            f"first {MAX_DEFAULT_COEFFICIENTS}; those after them reach {beyond.max():.1f} and move "
+            "the meshes alone.",
+            record,
+            stacklevel=4,
+        )
 
 
 def check_found(

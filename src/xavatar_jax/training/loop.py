@@ -16,7 +16,7 @@ from ..body import BodyModel, check_params, with_betas
 from ..frames import Frames
 from ..sampling import varied_frames
 from .budget import as_begun, check_minutes, frames_in_budget, say_fewer_frames
-from .check import check_found, notify
+from .check import check_expression, check_found, notify
 from .checkpoint import Keeper, load_checkpoint, run_identity
 from .config import FitConfig, check_start
 from .devices import ONE_DEVICE, Devices, share_work
@@ -143,6 +143,7 @@ def _labelled_pool(
     verbose: bool,
 ) -> FramePool:
     """Points of the frames and, if they are stored, their roots."""
+    check_expression(frames.params, history.notices)
     clock = time.perf_counter()
     with progress("points", len(frames), verbose=verbose, unit="frame") as bar:
         pool = label_frames(body, frames, config, bar=bar, notices=history.notices)

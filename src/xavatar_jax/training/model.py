@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_joints, canonical_vertices
+from ..body import FACES, LEFT_HAND, RIGHT_HAND, BodyModel, canonical_joints
+from ..body.params import MAX_DEFAULT_COEFFICIENTS
 from ..fields import (
     AbstractGeometryField,
     AbstractSkinningField,
@@ -19,7 +20,7 @@ from ..fields import (
     HashGeometry,
     MLPGeometry,
     MLPSkinning,
-    mean_canonical_vertices,
+    grid_vertices,
     random_grid_skinning,
     template_expression,
     template_grid_skinning,
@@ -49,7 +50,7 @@ def fresh_fields(
     if config.skinning.kind == "mlp":
         skinning = MLPSkinning(body.tree, config.skinning.mlp, key=key_skinning)
     elif betas is None or not _moves_grids(config):
-        skinning = _grids(body, mean_canonical_vertices(body), config.skinning, key_skinning)
+        skinning = _grids(body, grid_vertices(body), config.skinning, key_skinning)
     else:
         skinning = _person_grids(body, betas, config)
     return AvatarFields(skinning, _geometry(body, config.geometry, key_geometry, betas))
@@ -70,7 +71,7 @@ def _grids(
 
 
 def _person_grids(body: BodyModel, betas: Any, config: FitConfig) -> GridSkinning:
-    return _grids(body, _own_vertices(body, betas), config.skinning, _keys(config)[0])
+    return _grids(body, grid_vertices(body, betas), config.skinning, _keys(config)[0])
 
 
 def _moves_grids(config: FitConfig) -> bool:
@@ -85,11 +86,11 @@ def _geometry(
     Of grids, a person has joints around which rotations act, places that the body model's
     expression moves, and boxes of detail that reach around their own hands and face.
     """
-    expression = min(body.num_expression, 10)
+    expression = min(body.num_expression, MAX_DEFAULT_COEFFICIENTS)
     if config.kind == "mlp":
         return MLPGeometry(body.tree, expression, config.mlp, key=key)
-    mean = mean_canonical_vertices(body)
-    own = None if betas is None else _own_vertices(body, betas)
+    mean = grid_vertices(body)
+    own = None if betas is None else grid_vertices(body, betas)
     detail, face = _detail(body, config, mean, own)
     expressive = None
     if expression and face is not None:
@@ -128,11 +129,6 @@ def _geometry(
         (jnp.asarray(joints, jnp.float32), moves),
         is_leaf=lambda x: x is None,
     )
-
-
-def _own_vertices(body: BodyModel, betas: Any) -> Float[np.ndarray, "V 3"]:
-    vertices = canonical_vertices(body, jnp.asarray(betas, body.template.dtype))
-    return np.asarray(vertices, np.float64)
 
 
 _Box = tuple[np.ndarray, np.ndarray]

@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from .._version import __version__
 from ..body import FACES, HANDS, BodyModel, BodyParams
-from ..fields import mean_canonical_vertices, template_weights
+from ..fields import grid_vertices, template_weights
 from ..files import cache_path, flatten_named, load_arrays, save_arrays, unflatten_named
 from ..geometry import face_areas
 from ..losses import binary_cross_entropy, soft_occupancy
@@ -152,7 +152,7 @@ def _fits_skinning(config: FitConfig) -> bool:
 def _mean_shape_points(body: BodyModel, config: FitConfig) -> tuple[Array, Array, Array | None]:
     """Points around the mean shape, signed distances, and template weights for a network."""
     rng = np.random.default_rng(config.seed)
-    vertices, faces = mean_canonical_vertices(body), np.asarray(body.faces)
+    vertices, faces = grid_vertices(body), np.asarray(body.faces)
     labels = np.asarray(body.part_labels)[faces[:, 0]]
     density = face_areas(vertices, faces)
     # Small parts get more than their area's share.

@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import os
+import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,12 +215,10 @@ def fill_template(manifest: dict[str, Any], blob: bytes, title: str) -> str:
     parts = {
         "title": html.escape(title),
         "style": read("style.css"),
-        # Inside a script element nothing but "</" could end it.
-        "manifest": described.replace("</", "<\\/"),
+        # Inside a script element "</" and "<!--" would be read as markup.
+        "manifest": described.replace("<", "\\u003c"),
         "data": base64.b64encode(zlib.compress(blob, 9)).decode("ascii"),
         "script": "\n".join(read(name) for name in _SCRIPTS),
     }
-    text = read("page.html")
-    for name, value in parts.items():
-        text = text.replace("{{" + name + "}}", value)
-    return text
+    # All at once: what is put in is not looked through again.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], read("page.html"))

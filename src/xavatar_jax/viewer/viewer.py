@@ -14,7 +14,7 @@ import numpy as np
 
 from ..avatar import Avatar
 from ..avatar.animate import DEFAULT_FPS, MotionLike
-from ..body import BodyParams, facing, root_rotation
+from ..body import BodyParams, canonical_params, facing, root_rotation
 from ..frames import Frames
 from ..render import frame_view
 from .panel import Panel
@@ -69,8 +69,9 @@ class Viewer:
         try:
             while not self._stopped.wait(0.5):
                 pass
-        except KeyboardInterrupt:
-            pass
+        except KeyboardInterrupt as stop:
+            if type(stop) is not KeyboardInterrupt:  # a signal that a program has made one of
+                raise
         finally:
             self.stop()
         if self._error is not None:
@@ -255,7 +256,7 @@ def _start(server: Any, surfaces: Surfaces, axis: UpAxis, fps: float) -> Viewer:
         server,
         body.tree,
         num_frames=len(surfaces.params),
-        num_expression=surfaces.params.expression.shape[-1],
+        num_expression=canonical_params(body).expression.shape[-1],
         shadings=surfaces.shadings,
         max_error_mm=surfaces.max_error_mm,
         changed=changed.set,
