@@ -28,7 +28,12 @@ from xavatar_jax.training.objective import (
     make_anchors,
     skinning_objective,
 )
-from xavatar_jax.training.pool import label_frames, polish_roots, tabulate_for_search
+from xavatar_jax.training.pool import (
+    label_frames,
+    polish_roots,
+    rows_in_turn,
+    tabulate_for_search,
+)
 from xavatar_jax.training.progress import progress
 from xavatar_jax.training.step import batch_of, draw_batch
 
@@ -80,6 +85,22 @@ def test_polished_roots_belong_to_the_field_itself(case):
 
     assert np.quantile(gap(polished), 0.98) < 1e-5
     assert np.median(gap(polished)) <= np.median(gap(pool))
+
+
+def test_roots_are_polished_in_turn(case):
+    """The frames of a round as in a polish of all of them, and no others; each has its turn."""
+    body, _, config, fields, pool = case
+    table = tabulate_for_search(body, np.zeros(10), fields.skinning, config)
+    every = polish_roots(fields.skinning, table, pool, steps=1)
+    rounds = [rows_in_turn(number, 2, 3).tolist() for number in (1, 2, 3)]
+    assert rounds == [[0, 1], [2, 0], [1, 2]]
+    assert rows_in_turn(5, 9, 3).tolist() == [0, 1, 2]
+    some = polish_roots(fields.skinning, table, pool, steps=1, rows=np.array([2, 0]))
+    for name in ("root", "others"):
+        mixed, done, before = (np.asarray(getattr(p, name)) for p in (some, every, pool))
+        np.testing.assert_allclose(mixed[[0, 2]], done[[0, 2]], atol=1e-7)
+        np.testing.assert_array_equal(mixed[1], before[1])
+    assert not np.array_equal(every.root, pool.root)
 
 
 def test_batches_take_only_points_with_roots(case):

@@ -146,7 +146,8 @@ class FitConfig:
     - `frames_per_step`, `points_per_step` (of each frame).
     - `skinning_every`, `skinning_points`: with stored roots, every so many steps the skinning
       field is updated from so many points a frame; the other steps update the geometry.
-    - `polish_every`: steps after which stored roots follow the skinning field.
+    - `polish_every`: steps after which stored roots follow the skinning field, those of at most
+      `polish_frames` frames at a time, in turn.
     - `redraw_every`, `redraw_frames`: every so many steps the points of so many frames are drawn
       anew, one frame after another (0: never).
     - `prefit_steps`: steps that fit the geometry to the body's mean shape first, cached.
@@ -167,6 +168,7 @@ class FitConfig:
     skinning_every: int = 4
     skinning_points: int = 128
     polish_every: int = 400
+    polish_frames: int = 256
     redraw_every: int = 0
     redraw_frames: int = 8
     prefit_steps: int = 200

@@ -242,15 +242,32 @@ def _ordered(pool: FramePool, roots: np.ndarray, valid: np.ndarray) -> FramePool
     )
 
 
-def polish_roots(
-    skinning: AbstractSkinningField, table: TabulatedSkinning, pool: FramePool, *, steps: int
-) -> FramePool:
-    """Move every stored root to where the field has it now, by Newton steps.
+def rows_in_turn(number: int, count: int, total: int) -> Int[np.ndarray, " r"]:
+    """The frames of round 1, 2, ... if each takes the next `count` of `total`, or all of fewer."""
+    count = min(count, total)
+    return ((number - 1) * count + np.arange(count)) % total
 
-    Residuals are the field's own; Jacobians are the table's, which are close and cost a lookup.
+
+def polish_roots(
+    skinning: AbstractSkinningField,
+    table: TabulatedSkinning,
+    pool: FramePool,
+    *,
+    steps: int,
+    rows: Int[np.ndarray, " r"] | None = None,
+) -> FramePool:
+    """Move stored roots, of these frames or of all, to where the field has them now.
+
+    By Newton steps. Residuals are the field's own; Jacobians are the table's, which are close and
+    cost a lookup.
     """
     stored = pool.points, pool.root, pool.others, pool.transforms
-    root, others = _polish(skinning, table, stored, steps)
+    if rows is None or len(rows) == len(pool.points):
+        root, others = _polish(skinning, table, stored, steps)
+    else:
+        some = jax.tree.map(lambda leaf: leaf[rows], stored)
+        root, others = _polish(skinning, table, some, steps)
+        root, others = pool.root.at[rows].set(root), pool.others.at[rows].set(others)
     return eqx.tree_at(lambda p: (p.root, p.others), pool, (root, others))
 
 

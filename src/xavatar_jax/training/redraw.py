@@ -20,6 +20,7 @@ from .pool import (
     draw_points,
     polish_roots,
     pool_of,
+    rows_in_turn,
     search_roots,
     tabulate_for_search,
 )
@@ -59,8 +60,7 @@ class Redraw:
 
     def rows(self, number: int) -> Int[np.ndarray, " r"]:
         """Which frames of the pool a round replaces."""
-        count = min(self.config.redraw_frames, len(self.frames))
-        return ((number - 1) * count + np.arange(count)) % len(self.frames)
+        return rows_in_turn(number, self.config.redraw_frames, len(self.frames))
 
     def begin(self, step: int) -> None:
         """Let the thread make the first round that is due after this step."""

@@ -28,7 +28,7 @@ from .interrupt import StopFlag, stop_between_steps
 from .log import JsonLines
 from .model import AvatarFields
 from .objective import ExtraTerms, make_anchors
-from .pool import FramePool, grids_for_search, polish_roots, tabulate_on
+from .pool import FramePool, grids_for_search, polish_roots, rows_in_turn, tabulate_on
 from .progress import progress
 from .redraw import Redraw, put_rows
 from .step import Fall, make_steps, with_learned
@@ -289,10 +289,14 @@ class Run:
 
     def _polish(self) -> None:
         """Let stored roots follow the skinning field; on one device, for it is little work."""
+        config = self.config
+        number = self.at // config.polish_every
+        rows = rows_in_turn(number, config.polish_frames, len(self.pool.points))
         skinning = self.devices.collect(with_learned(self.base, self.state).skinning)
         table = tabulate_on(skinning, self.grids)
         # Since the last time roots have moved so little that one step leaves micrometres.
-        pool = polish_roots(skinning, table, self.devices.collect(self.pool), steps=1)
+        pool = self.devices.collect(self.pool)
+        pool = polish_roots(skinning, table, pool, steps=1, rows=rows)
         self.pool = self.devices.replicate(pool)
 
     def _tabulated(self, learned: Any) -> TabulatedSkinning:
