@@ -9,6 +9,8 @@ from jaxtyping import Int, Shaped
 
 from ..kinematics import KinematicTree
 
+_AT_ONCE = 1 << 20  # numbers: directions of a body are tens of millions
+
 
 def body_checksum(
     tree: KinematicTree, faces: Int[np.ndarray, "F 3"], *arrays: Shaped[np.ndarray, "..."]
@@ -21,5 +23,8 @@ def body_checksum(
     digest = hashlib.sha256(repr((tree.names, tree.parents)).encode())
     digest.update(np.ascontiguousarray(faces, np.int32).tobytes())
     for array in arrays:
-        digest.update(np.rint(np.asarray(array, np.float64) * 1e6).astype(np.int64).tobytes())
+        flat = np.ascontiguousarray(array).reshape(-1)
+        for start in range(0, len(flat), _AT_ONCE):
+            part = flat[start : start + _AT_ONCE].astype(np.float64)
+            digest.update(np.rint(part * 1e6).astype(np.int64).tobytes())
     return digest.hexdigest()
