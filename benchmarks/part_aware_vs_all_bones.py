@@ -103,7 +103,7 @@ def train(
     starts: StartSet,
 ) -> tuple[dict[str, Any], list[tuple[float, int, AvatarFields]]]:
     """Steps a second, and the fields as they were along the way, with seconds and steps."""
-    config = replace(config, search=replace(config.search, starts=starts), report_every=1)
+    config = replace(config, search=replace(config.search, starts=starts), report_every=5)
     way: list[tuple[float, int, AvatarFields]] = []
     clock = [time.perf_counter()]
 
