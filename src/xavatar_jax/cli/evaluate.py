@@ -55,9 +55,7 @@ def run(options: Options) -> None:
     started = time.perf_counter()
     count = count_of(options.eval_frames)
     check_file(options.out)
-    seed = options.seed
-    if seed is None:
-        seed = load_avatar_config(options.avatar).seed
+    seed = load_avatar_config(options.avatar).seed if options.seed is None else options.seed
     body = read_avatar_body(options.avatar, options.body)
     capture = read_capture(
         options.data,

@@ -54,15 +54,12 @@ def load_data(
     if not data_dir.is_dir():
         raise FileNotFoundError(f"No data folder at {data_dir}.")
     options: dict[str, Any] = {"gender": gender, "test": test, "verbose": verbose}
-    motions, subject = find_motions(data_dir), find_subject(data_dir)
-    if (motions or subject is not None) and flat_hand_mean is not None:
-        raise ValueError(
-            f"{data_dir}: hands are {'absolute' if motions else 'relative to the mean hand'} in "
-            "this layout; leave out flat_hand_mean"
-        )
-    if motions:
+    if find_motions(data_dir):
+        _refuse_hands(data_dir, flat_hand_mean, "absolute")
         return load_grab(data_dir, body, split_seed=split_seed, **options)
+    subject = find_subject(data_dir)
     if subject is not None:
+        _refuse_hands(data_dir, flat_hand_mean, "relative to the mean hand")
         return load_prepared(subject, body, **options)
     if find_frames(data_dir):
         flat = flat_hand_mean is not False
@@ -87,6 +84,11 @@ def find_gender(data_dir: str | Path) -> str | None:
         return None if gender == "unknown" else gender
     file = (find_subject(data_dir) or data_dir) / "gender.txt"
     return read_gender(file) if file.is_file() else None
+
+
+def _refuse_hands(data_dir: Path, flat_hand_mean: bool | None, known: str) -> None:
+    if flat_hand_mean is not None:
+        raise ValueError(f"{data_dir}: hands are {known} in this layout; leave out flat_hand_mean")
 
 
 def _unknown_layout(data_dir: Path) -> str:

@@ -67,8 +67,8 @@ class Motion:
         ):
             object.__setattr__(self, name, np.asarray(value, np.float64))
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
-        object.__setattr__(self, "fps", float(self.fps))
         _check(self)
+        object.__setattr__(self, "fps", float(self.fps))
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -186,7 +186,7 @@ def _check(motion: Motion) -> None:
         raise ValueError(f"{motion.source}: the motion has no frames.")
     if not (np.isfinite(motion.fps) and motion.fps > 0):
         raise ValueError(
-            f"{motion.source}: frame rate {motion.fps:g}; it must be positive. Give the right one "
+            f"{motion.source}: frame rate {motion.fps}; it must be positive. Give the right one "
             "with fps=."
         )
     if motion.up not in get_args(UpAxis):
