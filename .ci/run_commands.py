@@ -54,7 +54,7 @@ HOW = {
     f"{_FIT} --steps 300 --train-frames 24 --eval-frames 3 --out out/short": skip(
         "the example's stage, with about these options"
     ),
-    f"{_FIT} --out out/s1 --resume": skip("tests/training/test_checkpoint.py"),
+    f"{_FIT} --out out/s1 --resume": skip("tests/methods/xavatar/test_resuming.py"),
     f"{_OWN} --out out/mine": skip("the same with --test is run"),
     f"{_OWN} --test wave --out out/mine": How(True, SHORT),
     f"{_GRAB} GRAB/s1 --out out/s1": skip("the same with another folder is run"),
@@ -145,7 +145,7 @@ def stand_ins(folder: Path) -> None:
     import numpy as np
 
     import xavatar_jax as xa
-    from xavatar_jax.datasets import write_synthetic_capture
+    from xavatar_jax.synthetic import write_synthetic_capture
 
     body = xa.synthetic_body()
     (folder / "MODELS" / "smplx").mkdir(parents=True)

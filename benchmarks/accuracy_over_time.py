@@ -1,15 +1,15 @@
 """Held-out accuracy against minutes since the call of `fit`.
 
-Question: how near to unseen motion is an avatar after so many minutes of a method, all that the
-method does included, on this machine?
+Question: how accurate is an avatar on held-out motion after a given number of minutes, with all
+setup included, on this machine?
 
-Each point is a run of its own with that budget, from an empty cache of first fields, since a
-budget decides more than where a run is cut off: its frames, its schedule. The first fields of
-`paper` are made before, as are body and capture; evaluation does not count.
+Each point is a separate run with its own time limit and an empty cache of first fields, because
+the limit also determines the number of frames and the learning-rate schedule. The first fields of
+`paper`, the body and the capture are prepared before. Evaluation is excluded.
 
     python benchmarks/accuracy_over_time.py --json curve.json --picture curve.png [--only NAME...]
 
-The runs of table 2 are points of the curve, too: `--table2 FILE` takes them from there.
+`--table2 FILE` reuses the runs of table 2 as points of the curve.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ NAMES = ("quick", "paper", "SNARF", "SCANimate")
 def measure(
     name: str, minutes: float, seed: int, *, capture: Any, args: argparse.Namespace
 ) -> dict[str, Any]:
-    """Figures of one run."""
+    """Metrics of one run."""
     model, spent = learn(name, capture, minutes, seed, small=args.quick, cache=args.cache_dir)
     return {**spent, **score(model, capture.test, args.eval_frames)}
 
 
 def points_of_table2(file: str, settings: Mapping[str, Any]) -> list[Row]:
-    """The runs of that table, with their minutes.
+    """Runs of table 2, with their minutes.
 
-    **Raises:** `ValueError` if they are of other settings or of another machine.
+    **Raises:** `ValueError` if they have other settings or come from another machine.
     """
     rows = rows_of(Path(file), {**describe_machine(), **settings}, ("device", "cores", *settings))
     minutes = json.loads(Path(file).read_text(encoding="utf-8"))["header"]["minutes"]
@@ -52,7 +52,7 @@ def points_of_table2(file: str, settings: Mapping[str, Any]) -> list[Row]:
 
 
 def picture(rows: Sequence[Row], minutes: Sequence[float]) -> UInt8[np.ndarray, "H W 3"]:
-    """Chamfer distance over minutes, the whole body beside the hands; medians over seeds."""
+    """Charts of Chamfer distance over minutes, whole body and hands; medians over seeds."""
     found = medians(rows, ("name", "minutes"))
     charts = []
     for region, title in (("all", "Chamfer, whole body, mm"), ("hands", "Chamfer, hands, mm")):
@@ -68,10 +68,10 @@ def picture(rows: Sequence[Row], minutes: Sequence[float]) -> UInt8[np.ndarray, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Accuracy against minutes.")
+    parser = argparse.ArgumentParser(description="Accuracy over minutes.")
     add_options(parser, METHODS, minutes=MINUTES, seeds=1)
-    parser.add_argument("--picture", help="draw the curves into this PNG")
-    parser.add_argument("--table2", help="JSON of table2_grab.py: its runs are not made again")
+    parser.add_argument("--picture", help="PNG file for the chart")
+    parser.add_argument("--table2", help="JSON of table2_grab.py whose runs are reused")
     args = read_options(parser)
     names = args.only or (("quick",) if args.quick else NAMES)
     capture = xa.synthetic_capture(args.cache_dir)

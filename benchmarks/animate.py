@@ -1,15 +1,15 @@
-"""Animation and rigged export of an avatar: how fast, and what is lost for it.
+"""Speed and error of animation and rigged export.
 
-Question: how many frames a second does `Avatar.animate` pose, how far are they from the frames' own
-meshes, how long does a GLB file of 300 frames take, and how long the canonical surface at some
-sizes of cells?
+Question: how many frames per second does `Avatar.animate` pose, how far are they from the meshes of
+`Avatar.mesh`, and how long do a GLB file of 300 frames and the canonical surface at several cell
+sizes take?
 
     python benchmarks/animate.py out/fit_grab/avatar.npz [--quick] [--json FILE]
     python benchmarks/animate.py out/paper/avatar.npz --surface [--quick] [--json FILE]
 
-The avatar is one that `examples/fit_grab.py` wrote, on the bundled body; the motion is its held-out
-sequences, one after another. Each way of following pose and expression is a row; distances are
-those to `Avatar.mesh` of the same frame. `--surface` measures the canonical surface alone.
+The avatar is written by `examples/fit_grab.py` and uses the bundled body. The motion consists of
+the held-out sequences, concatenated. There is one row per value of `offsets`; distances are to
+`Avatar.mesh` of the same frame. `--surface` only measures the canonical surface.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def held_out_motion(body: xa.BodyModel, frames: int) -> xa.Motion:
 
 
 def measure_animation(animation: Animation, timed: int, compared: int) -> dict[str, Any]:
-    """Milliseconds a frame, wall clock and processor, and distances in millimetres."""
+    """Wall and CPU time per frame, milliseconds, and distances, millimetres."""
     animation.frame_vertices(0)  # compiles
     wall, processor = time.perf_counter(), time.process_time()
     for k in range(timed):
@@ -67,7 +67,7 @@ def measure_animation(animation: Animation, timed: int, compared: int) -> dict[s
 
 
 def measure_export(avatar: xa.Avatar, motion: xa.Motion, influences: Any) -> dict[str, Any]:
-    """Seconds of a second export, size, and what the file loses."""
+    """Seconds of a second export, file size, and error of the rig."""
     with tempfile.TemporaryDirectory() as folder:
         report: GlbExport | None = None
         seconds = 0.0
@@ -91,7 +91,7 @@ def measure_export(avatar: xa.Avatar, motion: xa.Motion, influences: Any) -> dic
 
 
 def measure_extraction(avatar: xa.Avatar, cells: str) -> dict[str, Any]:
-    """Seconds of a first and a second extraction, without a limit, and what memory rises."""
+    """Seconds of a first and a second extraction without vertex limit, and memory increase."""
     taken, vertices = [], 0
 
     def extract() -> None:
@@ -115,12 +115,12 @@ def measure_extraction(avatar: xa.Avatar, cells: str) -> dict[str, Any]:
 def measure_motion(
     avatar: xa.Avatar, quick: bool
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]]:
-    """Rows of animation and of export, and what comes before the first frame."""
+    """Rows of animation and of export, and the costs before the first frame."""
     motion = held_out_motion(avatar.body, 60 if quick else 300)
     start = time.perf_counter()
     avatar.canonical_mesh()
     extracted = time.perf_counter()
-    jax.block_until_ready(avatar.neutral_surface)
+    jax.block_until_ready(avatar.rest)
     ready = time.perf_counter()
     rows = [
         measure_animation(
@@ -149,8 +149,8 @@ def main() -> None:
     )
     parser.add_argument("avatar", help="avatar.npz of examples/fit_grab.py")
     parser.add_argument("--quick", action="store_true", help="fewer frames")
-    parser.add_argument("--surface", action="store_true", help="the canonical surface alone")
-    parser.add_argument("--json", help="write the figures to this file")
+    parser.add_argument("--surface", action="store_true", help="measure the canonical surface only")
+    parser.add_argument("--json", help="JSON file for the results")
     args = parser.parse_args()
     body = xa.synthetic_body()
     avatar = xa.load_avatar(args.avatar, body=body)
@@ -163,7 +163,7 @@ def main() -> None:
         "question": "frames a second of animation, distance to exact frames, time of export",
         **describe_machine(),
         "quick": args.quick,
-        "preset": avatar.config.preset,
+        "preset": avatar.options["preset"],
         **base,
         "exports": exports,
         "extractions": extractions,

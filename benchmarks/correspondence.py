@@ -1,16 +1,16 @@
-"""Throughput and recall of every way to search for correspondences.
+"""Throughput and recall of all correspondence searches.
 
-Questions: how many points a second does each path search, on which field, from which starts, at
-which difficulty and batch size; and does it find the roots that are known to be there?
+Questions: how many points per second does each search handle, by field, start set, pose range and
+batch size? Does it find the known roots?
 
-A *known* root is the canonical point that the field itself carried to the posed one. All paths get
-the same frames, points and field. The plain path, one `optimistix.root_find` a start under `vmap`,
-is the measure of the others; it is given a part of the points, since it is slow.
+A *known* root is the canonical point that the field itself maps to the posed point. All searches
+get the same frames, points and field. The reference path, one `optimistix.root_find` per start
+under `vmap`, is the baseline; it runs on a subset of the points because it is slow.
 
     python benchmarks/correspondence.py [--quick] [--json FILE] [--picture FILE] [--tables NAME...]
 
-A table is written as it ends. With `--tables`, those named are measured, and the file keeps the
-others.
+Tables are written as they finish. `--tables` measures some of them and keeps the others in the
+file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from search_problems import (
 from self_contact import contact_points, contact_poses, inner_nodes, root_shares
 
 import xavatar_jax as xa
-from xavatar_jax.body import HANDS, BodyModel
+from xavatar_jax.body import BodyModel
 from xavatar_jax.correspondence import (
     Group,
     StartSet,
@@ -67,7 +67,7 @@ from xavatar_jax.fields import (
 from xavatar_jax.render import grid_picture, save_png
 from xavatar_jax.report import describe_machine, line_chart
 
-# Points that share one tabulating and one blending of transforms in `points_per_s_with_tables`.
+# Points per tabulation and blending of transforms in `points_per_s_with_tables`.
 SHARED_BY = 100_000
 PATHS = (("plain", "mlp"), ("batched", "mlp"), ("guided", "mlp"), ("plain", "grid"), ("grid",) * 2)
 COLUMNS = (
@@ -78,7 +78,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured; spacings in mm as body, hands, face."""
+    """Size of the benchmark; spacings in mm for body, hands, face."""
 
     prefit_steps: int = FULL_PREFIT
     starts: tuple[StartSet, ...] = ("paper", "part_aware", "all_bones", "full", "body")
@@ -122,7 +122,7 @@ QUICK = Size(
 
 
 class Fields(NamedTuple):
-    """The network, the same tabulated (a field, or a guide), and what that took in seconds."""
+    """The network, its tabulation (a field or a guide), and the seconds these took."""
 
     mlp: AbstractSkinningField
     grid: TabulatedSkinning
@@ -131,7 +131,7 @@ class Fields(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A compiled path: roots `(P, K, 3)`, valid and residuals of a problem; and what it took."""
+    """A compiled search, the seconds to compile it, and its temporary memory."""
 
     run: Callable[[Problem], Any]
     compile_s: float
@@ -141,7 +141,7 @@ class Search(NamedTuple):
 def tabulated(
     body: BodyModel, vertices: np.ndarray, mlp: AbstractSkinningField, mm: tuple, repeats: int = 2
 ) -> Fields:
-    """The network on grids of a spacing, timed after compilation."""
+    """Tabulate the network on grids of a spacing, timed after compilation."""
     spacing = GridSpacing(body=mm[0] / 1e3, hands=mm[1] / 1e3, face=mm[2] / 1e3)
     grids = body_part_grids(body, vertices, spacing)
     table = eqx.filter_jit(tabulate)
@@ -155,7 +155,7 @@ def tabulated(
 def compiled(
     path: str, field: AbstractSkinningField, fields: Fields, table: StartTable, first: Problem
 ) -> Search:
-    """A fast path for problems of the first one's size; the guide is posed before any clock."""
+    """Compile a search for problems of the size of `first`; posing the guide is not timed."""
     pose = jax.jit(pose_grid)
     clock = time.perf_counter()
     if path == "grid":
@@ -200,12 +200,12 @@ def plain_row(
     starts: StartSet,
     size: Size,
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """The plain path, part by part, on a share of the points; it starts at bones only.
+    """Metrics of the reference path on a subset of the points, and a mask of this subset.
 
-    And which points of all problems these are.
+    The reference path runs part by part and starts at bones only.
     """
-    # Points of one group are searched together.
-    of_part = [group.bones for group in groups_by_part(body.tree, starts).values()]
+    # Search the points of each group together.
+    of_part = [group.bones for group in groups_by_part(body, starts).values()]
     spent, compile_s, lanes, steps = 0.0, 0.0, 0, 0
     hit, parts, residuals = [], [], []
     asked = np.zeros((len(problems), size.points), bool)
@@ -251,7 +251,7 @@ def fast_row(
     repeats: int,
     asked: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """A compiled path on whole frames; its recall of the points that the plain path was asked."""
+    """A compiled search on whole frames; `asked` marks the points of the reference path."""
     spent, lanes, steps = 0.0, 0, 0
     hit, parts, residuals, peak = [], [], [], None
     for k, p in enumerate(problems):
@@ -286,7 +286,7 @@ def fast_row(
 def paths_table(
     body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
-    """Paths x fields x start sets x difficulty."""
+    """Paths x fields x start sets x pose range."""
     problems = {
         (name, degrees): hard_problems(
             body,
@@ -302,9 +302,9 @@ def paths_table(
     }
     rows, asked = [], {}
     for starts in size.starts:
-        # Programs take memory maps, of which a process has some 65,000.
+        # Compiled programs use memory maps, and a process can have about 65,000.
         jax.clear_caches()
-        table = start_table(body.tree, starts)
+        table = start_table(body, starts)
         for path, name in PATHS:
             if path == "plain" and name == "grid" and not size.plain_grid:
                 continue
@@ -321,7 +321,7 @@ def paths_table(
                 label = {"path": path, "field": name, "starts": starts, "pose_deg": degrees}
                 rows.append({"table": "paths", **label, **measured})
                 print_rows(rows[-1:], COLUMNS)
-    # Each against the plain path on the network, from the same starts.
+    # Relative to the reference path on the network with the same starts.
     plain = {
         (r["starts"], r["pose_deg"]): r["points_per_s"]
         for r in rows
@@ -346,8 +346,8 @@ def one_frame(
 def batch_table(
     body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
-    """Throughput and memory against the number of points given at once."""
-    table = start_table(body.tree, "part_aware")
+    """Throughput and memory by number of points per call."""
+    table = start_table(body, "part_aware")
     transforms = hard_problems(
         body, fields.grid, vertices, degrees=20.0, frames=1, count=60, seed=seed
     )[0].transforms
@@ -360,7 +360,7 @@ def batch_table(
             field, tables = getattr(fields, name), guides if path == "guided" else fields
             case = one_frame(body, vertices, field, transforms, count, seed)
             search = compiled(path, field, tables, table, case)
-            # The fewer the points, the more a moment's load on the machine would weigh.
+            # Repeat small batches more often, since load on the machine affects them more.
             often = max(size.repeats, size.repeats * 100_000 // count)
             row = fast_row(search, [case], tables, path, 1 if path == "batched" else often)
             label = {"path": path, "field": name, "starts": "part_aware", "pose_deg": 20.0}
@@ -372,7 +372,7 @@ def batch_table(
 def bones_table(
     body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
-    """Throughput against the number of bones that start each point."""
+    """Throughput by number of start bones per point."""
     every = part_groups(body.tree, "paper")["full"].bones
     rows = []
     for path, name in (("guided", "mlp"), ("grid", "grid")):
@@ -382,7 +382,7 @@ def bones_table(
             degrees=20.0, frames=2, count=size.points, seed=seed,
         )  # fmt: skip
         for count in size.bones:
-            table = start_table(body.tree, "all_bones", {"full": Group(every[:count])})
+            table = start_table(body, "all_bones", {"full": Group(every[:count])})
             search = compiled(path, getattr(fields, name), tables, table, cases[0])
             row = fast_row(search, cases, tables, path, size.repeats)
             label = {"path": path, "field": name, "starts": f"{count} bones", "pose_deg": 20.0}
@@ -394,9 +394,9 @@ def bones_table(
 def resolution_table(
     body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
-    """What a grid of each spacing costs, and how near it is to the network."""
+    """Cost of a grid by spacing, and its distance from the network."""
     del guides  # each row has its own
-    mlp, table, rows = fields.mlp, start_table(body.tree, "part_aware"), []
+    mlp, table, rows = fields.mlp, start_table(body, "part_aware"), []
     weigh = eqx.filter_jit(lambda field, x: jax.vmap(field)(x))
     for mm in size.resolutions_mm:
         fields = tabulated(body, vertices, mlp, mm)
@@ -421,7 +421,7 @@ def resolution_table(
                         cases, fields, "grid", size.repeats)  # fmt: skip
         guided = fast_row(compiled("guided", mlp, fields, table, own[0]),
                           own, fields, "guided", 1)  # fmt: skip
-        hands = np.isin(parts, HANDS)
+        hands = np.isin(parts, body.parts.members("hands"))
         rows.append(
             {
                 "table": "resolution",
@@ -451,15 +451,15 @@ def resolution_table(
 def contact_table(
     body: BodyModel, vertices: np.ndarray, fields: Fields, guides: Fields, size: Size, seed: int
 ) -> list[dict[str, Any]]:
-    """Whether every root is found where the body touches itself."""
+    """Recall of all roots where the body touches itself."""
     poses = contact_poses(body, vertices, size.contacts)
     nodes = inner_nodes(body, vertices, fields.grid.grids)
     tables = (
-        ("full", start_table(body.tree, "full"), "label"),
-        ("all_bones", start_table(body.tree, "all_bones"), "label"),
-        ("part_aware", start_table(body.tree, "part_aware"), "label"),
-        ("part_aware, both parts", start_table(body.tree, "part_aware", pairs=True), "pair_row"),
-        ("paper, both parts", start_table(body.tree, "paper", pairs=True), "pair_row"),
+        ("full", start_table(body, "full"), "label"),
+        ("all_bones", start_table(body, "all_bones"), "label"),
+        ("part_aware", start_table(body, "part_aware"), "label"),
+        ("part_aware, both parts", start_table(body, "part_aware", pairs=True), "pair_row"),
+        ("paper, both parts", start_table(body, "paper", pairs=True), "pair_row"),
     )
     paths = (("grid", "grid"), ("guided", "mlp"), ("batched", "mlp"))
     pose = jax.jit(pose_grid)
@@ -504,7 +504,7 @@ TABLES = {
 
 
 def draw(rows: list[dict[str, Any]], path: str) -> None:
-    """Throughput against batch size, and against the number of bones."""
+    """Draw throughput by batch size and by number of bones."""
     names = {"grid": "grid field", "guided": "network, guided by the grid", "batched": "network"}
     batches, bones = {}, {}
     for row in rows:
@@ -516,32 +516,32 @@ def draw(rows: list[dict[str, Any]], path: str) -> None:
         count = {"body": 9, "all_bones": 45}.get(row.get("starts", ""))
         measured = (row["table"], row.get("path"), row.get("field"), row.get("pose_deg"))
         if bones and count and measured == ("paths", "plain", "mlp", 20.0):
-            bones.setdefault("network, plain path", []).append((count, row["points_per_s"]))
+            bones.setdefault("network, reference path", []).append((count, row["points_per_s"]))
     bones = {name: sorted(line) for name, line in bones.items()}
     charts = []
     if batches:
         ticks = sorted({p[0] for line in batches.values() for p in line})
         charts.append(
-            line_chart(batches, title="points/s", x_label="points at once", x_ticks=ticks)
+            line_chart(batches, title="points/s", x_label="points per call", x_ticks=ticks)
         )
     if bones:
         ticks = sorted({p[0] for line in bones.values() for p in line})
         charts.append(
-            line_chart(bones, title="points/s", x_label="bones that start a point", x_ticks=ticks)
+            line_chart(bones, title="points/s", x_label="start bones per point", x_ticks=ticks)
         )
     save_png(path, grid_picture([charts]))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Correspondence search: throughput and recall.")
-    parser.add_argument("--quick", action="store_true", help="small: ends within a minute or two")
-    parser.add_argument("--json", help="write header and rows to this file")
-    parser.add_argument("--picture", help="write a chart (PNG) to this file")
+    parser.add_argument("--quick", action="store_true", help="small run of a minute or two")
+    parser.add_argument("--json", help="JSON file for header and rows")
+    parser.add_argument("--picture", help="PNG file for the chart")
     names = ", ".join(TABLES)
     parser.add_argument("--tables", nargs="+", choices=TABLES, metavar="NAME",
-                        help=f"of {names}; the others stay as they are in the file")  # fmt: skip
+                        help=f"tables to measure ({names}); others are kept")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--prefit-steps", type=int, help="steps of fitting the network")
+    parser.add_argument("--prefit-steps", type=int, help="number of steps to fit the network")
     parser.add_argument("--cache-dir")
     args = parser.parse_args()
     size = QUICK if args.quick else Size()
@@ -558,8 +558,8 @@ def main() -> None:
         "seed": args.seed,
         **asdict(size),
         "prefit_steps": steps,
-        "pose_law": "normal, pose_deg rms an axis on every joint, 0.3 of that on pelvis and spine",
-        "point_law": "3 of 6 body, 1 face, 1 each hand; 5 mm rms an axis around the mean shape",
+        "pose_law": "normal, pose_deg rms per axis on every joint, 0.3 of it on pelvis and spine",
+        "point_law": "3/6 body, 1/6 face, 1/6 each hand; 5 mm rms per axis around the mean shape",
         "tabulate_s": fields.tabulate_s,
         "pose_s": fields.pose_s,
         "guide_tabulate_s": guides.tabulate_s,

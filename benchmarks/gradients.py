@@ -1,12 +1,12 @@
-"""Derivatives of roots: implicit against unrolled iterations against finite differences.
+"""Derivatives of roots: implicit, through unrolled iterations, and by finite differences.
 
-Questions: are the implicit derivatives of a root those that finite differences give, for the
-field's parameters, the bone transforms and the posed point, in forward and reverse mode? What do
-they cost beside differentiating the iterations themselves? What does float32 change?
+Questions: do implicit derivatives agree with finite differences, with respect to the field's
+parameters, the bone transforms and the posed point, in forward and reverse mode? What do they cost
+compared with differentiating the iterations? What is the error of float32?
 
-The field is the paper's network on randomly posed bodies. Roots are taken to 1e-12 in float64, each
-from its own bone. Every derivative is taken along one random direction of what is varied; its
-relative error is the norm of the difference over the norm of the finite difference.
+The field is the paper's network on randomly posed bodies. Roots are solved to 1e-12 in float64.
+Each derivative is taken along one random direction. Its relative error is the norm of the
+difference divided by the norm of the finite difference.
 
     python benchmarks/gradients.py [--quick] [--json FILE]
 """
@@ -28,13 +28,13 @@ from search_problems import FULL_PREFIT, QUICK_PREFIT, hard_problems, paper_fiel
 
 import xavatar_jax as xa
 from xavatar_jax.correspondence import (
+    MIN_DETERMINANT,
     Broyden,
     find_correspondences,
     implicit_root,
     search_field,
     start_table,
 )
-from xavatar_jax.correspondence.implicit import MIN_DETERMINANT
 from xavatar_jax.fields import (
     AbstractSkinningField,
     grid_vertices,
@@ -45,12 +45,12 @@ from xavatar_jax.report import describe_machine
 
 VARIED = ("field", "transforms", "point")
 UNROLLED_STEPS = {"newton": 12, "broyden": 30}
-# Two steps of central differences, combined so that their third-order errors cancel.
+# Step sizes of central differences; two of them are combined to cancel third-order errors.
 STEP = {"field": 1e-5, "transforms": 1e-5, "point": 2e-6}
 
 
 class Case:
-    """Roots of one field and several frames, in the precision that is enabled."""
+    """Roots of one field and several frames, in the enabled precision."""
 
     def __init__(self, field: Any, problems: list, count: int, seed: int):
         rng = np.random.default_rng([seed, 4])
@@ -85,7 +85,7 @@ class Case:
         return eqx.combine(leaves, self.static)
 
     def moved(self, varied: str, by: Array) -> tuple[Any, Array, Array]:
-        """Parameters, transforms and points with one of them moved along its direction."""
+        """Parameters, transforms and points, with one of them moved along its direction."""
         args = {"field": self.leaves, "transforms": self.transforms, "point": self.x_d}
         args[varied] = jax.tree.map(lambda v, d: v + by * d, args[varied], self.direction[varied])
         return args["field"], args["transforms"], args["point"]
@@ -109,7 +109,7 @@ def newton_roots(case: Case, start: Array, leaves: Any, transforms: Array, x_d: 
 
 
 def broyden_roots(case: Case, start: Array, leaves: Any, transforms: Array, x_d: Array, steps: int):
-    """Broyden's method from each start; a lane that has arrived stays where it is."""
+    """Broyden's method from each start; converged lanes stay fixed."""
     tolerance = 1e-12 if start.dtype == jnp.float64 else 1e-6
 
     def one(x: Array, x_d: Array, b: Array) -> Array:
@@ -143,8 +143,8 @@ def methods(
         return jax.vmap(one)(root, x_d, transforms)
 
     def plain(leaves: Any, transforms: Array, x_d: Array) -> Array:
-        # From the root itself: no bone's pull-back need lead to it. A tree of one bone that
-        # stands still gives that start.
+        # Start from the root itself, which no bone's inverse transform need lead to: an extra
+        # bone without weight provides this start.
         def one(x: Array, p: Array, b: Array) -> Array:
             field = Anchored(case.field(leaves))
             still = (
@@ -175,7 +175,7 @@ def methods(
 
 
 class Anchored(AbstractSkinningField):
-    """A field with one more bone, which never has weight: its pull-back is a start of choice."""
+    """A field with one extra bone of zero weight, whose inverse transform gives a chosen start."""
 
     inner: AbstractSkinningField
 
@@ -189,9 +189,9 @@ class Anchored(AbstractSkinningField):
 def directional(
     fn: Callable[[Any, Array, Array], Array], case: Case, varied: str, mode: str
 ) -> Callable[[], Array]:
-    """The derivative along the direction: `(P, 3)` forward; one number by cotangents, reverse.
+    """The derivative along a direction: `(P, 3)` in forward mode, one number in reverse mode.
 
-    Mode gradient: all that reverse mode gives, as one vector.
+    Mode `gradient` returns the full gradient of reverse mode as one vector.
     """
     position = VARIED.index(varied)
     args = (case.leaves, case.transforms, case.x_d)
@@ -217,7 +217,7 @@ def directional(
 
 
 def differences(case: Case, root: Array, varied: str) -> Array:
-    """Central differences of roots found anew, of fourth order."""
+    """Fourth-order central differences of recomputed roots."""
 
     @jax.jit
     def at(by: Array) -> Array:
@@ -234,7 +234,7 @@ def differences(case: Case, root: Array, varied: str) -> Array:
 def accuracy_rows(
     field: Any, problems: list, count: int, seed: int, names: tuple[str, ...]
 ) -> tuple[list, dict[str, Any]]:
-    """Errors of every method in float64, and those of float32 beside float64."""
+    """Errors of every method in float64, and the references for float32."""
     rows, kept = [], {}
     with jax.enable_x64(True):
         case = Case(field, problems, count, seed)
@@ -254,7 +254,7 @@ def accuracy_rows(
                 found = np.asarray(directional(fn, case, varied, "forward")())
                 gap = (np.linalg.norm(found - expected, axis=-1) / scale)[regular]
                 rows.append(_row(name, varied, "forward", gap, found))
-                # Reverse mode gives one number for all points at once: by linearity the same sum.
+                # Reverse mode gives one number for all points: by linearity, the same sum.
                 chosen = jnp.where(jnp.asarray(regular)[:, None], case.cotangent, 0.0)
                 case.cotangent, before = chosen, case.cotangent
                 total = float(directional(fn, case, varied, "reverse")())
@@ -293,12 +293,12 @@ def _row(method: str, varied: str, mode: str, gap: np.ndarray, found: np.ndarray
 
 
 def float32_rows(field: Any, problems: list, count: int, seed: int, kept: dict) -> list:
-    """Implicit derivatives in float32, at roots of the float32 search, against float64."""
+    """Implicit derivatives in float32, at roots of the float32 search, relative to float64."""
     case, rows = Case(field, problems, count, seed), []
     regular = jnp.asarray(kept["regular"])[:, None]
     case.cotangent = jnp.where(regular, case.cotangent, 0.0)
     near = jnp.asarray(kept["root"], jnp.float32)
-    # A root as the search leaves it: some 1e-5 m away in posed space.
+    # Roots with the residual of a search: about 1e-5 m in posed space.
     rng = np.random.default_rng([seed, 5])
     away = rng.standard_normal(near.shape)
     away = 1e-5 * away / np.linalg.norm(away, axis=-1, keepdims=True)
@@ -311,7 +311,7 @@ def float32_rows(field: Any, problems: list, count: int, seed: int, kept: dict) 
             for mode in ("forward", "gradient"):
                 found = np.asarray(directional(fn, case, varied, mode)())
                 expected = kept["float64"][varied, mode]
-                # One vector for all points by reverse mode, the same that a training step takes.
+                # In reverse mode, one vector for all points, as in a training step.
                 chosen = kept["regular"] if mode == "forward" else None
                 found, expected = found[chosen], expected[chosen]
                 gap = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
@@ -332,7 +332,7 @@ def float32_rows(field: Any, problems: list, count: int, seed: int, kept: dict) 
 
 
 def time_rows(field: Any, problems: list, count: int, seed: int, repeats: int) -> list:
-    """Seconds for roots and derivatives together, float32."""
+    """Time of roots and derivatives together, float32."""
     case, rows = Case(field, problems, count, seed), []
     points = len(case.x_d)
     root = newton_roots(case, case.start, case.leaves, case.transforms, case.x_d, 6)
@@ -357,8 +357,8 @@ def time_rows(field: Any, problems: list, count: int, seed: int, repeats: int) -
 
 
 def step_row(body: Any, field: Any, problems: list) -> dict[str, Any]:
-    """A training step with the search inside: compile time, and traces of a second call."""
-    table = start_table(body.tree)
+    """Compile time and number of traces of a training step with the search inside."""
+    table = start_table(body)
     traces = []
 
     @eqx.filter_jit
@@ -392,10 +392,10 @@ def step_row(body: Any, field: Any, problems: list) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Derivatives of roots: error and time.")
-    parser.add_argument("--quick", action="store_true", help="small: ends within a minute or two")
-    parser.add_argument("--json", help="write header and rows to this file")
+    parser.add_argument("--quick", action="store_true", help="small run of a minute or two")
+    parser.add_argument("--json", help="JSON file for header and rows")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--prefit-steps", type=int, help="steps of fitting the network")
+    parser.add_argument("--prefit-steps", type=int, help="number of steps to fit the network")
     parser.add_argument("--cache-dir")
     args = parser.parse_args()
     steps = args.prefit_steps or (QUICK_PREFIT if args.quick else FULL_PREFIT)

@@ -1,4 +1,4 @@
-"""Clocks, memory and tables, shared by the benchmarks."""
+"""Timing, memory and tables, shared by the benchmarks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from xavatar_jax.report import write_json
 
 
 def least_time(run: Callable[[], Any], repeats: int) -> tuple[Any, float]:
-    """What `run` returns, and the least of its times in seconds; results are waited for."""
+    """Result of `run`, and its minimum time in seconds, blocking on results."""
     spent, result = [], None
     for _ in range(repeats):
         clock = time.perf_counter()
@@ -24,10 +24,10 @@ def least_time(run: Callable[[], Any], repeats: int) -> tuple[Any, float]:
 
 
 def peak_rise_mb(run: Callable[[], Any]) -> float | None:
-    """By how much resident memory rises at most while something runs, MiB; None if not Linux."""
+    """Peak increase of resident memory during `run`, MiB; None outside Linux."""
     mark, status = Path("/proc/self/clear_refs"), Path("/proc/self/status")
     try:
-        mark.write_text("5")  # the high-water mark starts again from here
+        mark.write_text("5")  # reset the high-water mark
         before = _resident_kb(status, "VmRSS")
         run()
         return max(_resident_kb(status, "VmHWM") - before, 0) / 1024
@@ -41,7 +41,7 @@ def _resident_kb(status: Path, name: str) -> int:
 
 
 def print_rows(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
-    """A plain table of some columns, wide ones as they are."""
+    """Print some columns as a plain-text table."""
     cells = [[_cell(row.get(name)) for name in columns] for row in rows]
     widths = [max(len(c[k]) for c in [columns, *cells]) for k in range(len(columns))]
     for line in (list(columns), *cells):
@@ -57,7 +57,7 @@ def _cell(value: Any) -> str:
 def write_result(
     path: str | os.PathLike[str] | None, header: Mapping[str, Any], rows: Sequence[Any]
 ) -> None:
-    """Write the result of a benchmark to a JSON file, if there is to be one."""
+    """Write the result of a benchmark to a JSON file, if `path` is given."""
     if path:
         write_json(path, {"header": header, "rows": rows})
         print(f"written: {path}", flush=True)

@@ -1,12 +1,12 @@
-"""Peak memory of learning, with few frames to learn from and with many.
+"""Peak memory of training with few and with many available frames.
 
-Question: does the memory of `fit` grow with the length of the sequences? Each count of frames runs
-in a process of its own, whose peak is read after learning and after an evaluation.
+Question: does the memory of `fit` grow with the length of the sequences? Each frame count runs in a
+separate process, whose peak is read after training and after an evaluation.
 
     python benchmarks/memory.py [--quick] [--counts 500 10000] [--json FILE]
 
-The frames are those of the bundled capture again and again, each time in poses a little off; they
-are posed when they are read, as those of a long recording are read from files.
+The frames repeat those of the bundled capture with perturbed poses. They are posed on access, as
+frames of a long recording are read from files.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dataclasses import replace
 from typing import Any
 
 NOISE_DEG = 5.0
-LENGTH = 500  # frames of a sequence
+LENGTH = 500  # frames per sequence
 
 
 def many_frames(capture: Any, count: int, seed: int = 0) -> Any:
-    """So many lazy frames, in sequences of `LENGTH`."""
+    """`count` lazy frames, in sequences of `LENGTH`."""
     import numpy as np
 
     from xavatar_jax.frames import frames_from_params
@@ -41,7 +41,7 @@ def many_frames(capture: Any, count: int, seed: int = 0) -> Any:
 
 
 def learn(count: int, steps: int, train_frames: int, cache: str | None) -> dict[str, Any]:
-    """Learn from so many frames in this process; peaks in MiB after each stage."""
+    """Train on `count` frames in this process; peaks in MiB after each stage."""
     import xavatar_jax as xa
     from xavatar_jax.report.machine import peak_rss_mb
 
@@ -58,7 +58,7 @@ def learn(count: int, steps: int, train_frames: int, cache: str | None) -> dict[
 
 
 def in_a_child(count: int, args: argparse.Namespace) -> dict[str, Any]:
-    """The row of `learn`, run in a process of its own, which begins with no memory of this one."""
+    """The row of `learn`, run in a new process, so that peaks do not include this one."""
     words = [sys.executable, __file__, "--child", str(count), "--steps", str(args.steps)]
     words += ["--train-frames", str(args.train_frames)]
     words += ["--cache-dir", args.cache_dir] if args.cache_dir else []
@@ -67,12 +67,12 @@ def in_a_child(count: int, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Peak memory of learning from many frames.")
+    parser = argparse.ArgumentParser(description="Peak memory of training with many frames.")
     parser.add_argument("--counts", type=int, nargs="+", default=[500, 10_000])
     parser.add_argument("--steps", type=int, default=150)
     parser.add_argument("--train-frames", type=int, default=200)
-    parser.add_argument("--quick", action="store_true", help="40 frames learned from, 25 steps")
-    parser.add_argument("--json", help="write header and rows to this file")
+    parser.add_argument("--quick", action="store_true", help="40 training frames, 25 steps")
+    parser.add_argument("--json", help="JSON file for header and rows")
     parser.add_argument("--cache-dir")
     parser.add_argument("--child", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -81,8 +81,8 @@ def main() -> None:
         return
     if args.quick:
         args.steps, args.train_frames = 25, 40
-    # The library is imported after the children have run: what a process holds when it starts
-    # another one counts as that one's peak.
+    # Import the library after the children have run: the memory of a process when it forks
+    # counts towards the peak of the child.
     rows = [in_a_child(count, args) for count in args.counts]
     from measuring import print_rows, write_result
 

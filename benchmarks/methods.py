@@ -1,9 +1,8 @@
-"""The methods that tables compare: `METHODS[name](frames, minutes, seed)`.
+"""The methods compared in the tables: `METHODS[name](frames, minutes, seed)`.
 
-A call learns from frames within so many minutes, counted from it, and gives something that
-`xa.evaluate` takes. All that a method does is part of them, the fit of its first fields to the
-body's mean shape included; but the paper's networks take long to fit, and have theirs from the
-cache folder, where `prepare` puts them before.
+A call trains for a number of minutes since the call and returns an object for `xa.evaluate`. The
+time includes everything, also the fit of the first fields to the body's mean shape. The paper's
+networks are an exception: their fit takes long, so `prepare` stores it in the cache folder first.
 """
 
 from __future__ import annotations
@@ -15,32 +14,33 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import numpy as np
+from search_problems import mean_shape_model
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Avatar, Posable
-from xavatar_jax.baselines import (
-    ScanimateConfig,
-    body_only,
+from xavatar_jax.avatar import Avatar, Drivable, body_only
+from xavatar_jax.body import BodyModel
+from xavatar_jax.frames import Frames
+from xavatar_jax.methods import (
     fit_scanimate,
     fit_snarf,
     scanimate_paper,
     scanimate_quick,
     snarf_paper,
     snarf_quick,
-    start_fields,
 )
-from xavatar_jax.body import BodyModel
-from xavatar_jax.frames import Frames
-from xavatar_jax.training import FitConfig, initial_fields
+from xavatar_jax.methods.scanimate import ScanimateConfig
+from xavatar_jax.methods.scanimate.fit import start_model
+from xavatar_jax.methods.xavatar import FitConfig
 
-STEPS = 100_000  # more than any budget here holds: minutes decide
+STEPS = 100_000  # more than any time limit here allows
 
 
 @dataclass(frozen=True)
 class Method:
-    """A function that learns, and its config.
+    """A training function and its preset.
 
-    `prepared`: first fields come from the cache folder, and are no part of the minutes.
+    `prepared`: first fields come from the cache folder and are not part of the minutes.
     """
 
     learn: Callable[..., Any]
@@ -55,17 +55,17 @@ class Method:
         *,
         small: bool = False,
         cache: str | None = None,
-    ) -> Posable:
+    ) -> Drivable:
         config = self.config(minutes, seed, small)
         if self.prepared:
             found = self.learn(frames, config, cache=cache, verbose=False)
         else:
             with tempfile.TemporaryDirectory() as empty:
                 found = self.learn(frames, config, cache=empty, verbose=False)
-        return found.avatar if self.learn is xa.fit else found
+        return found.avatar
 
     def config(self, minutes: float, seed: int, small: bool) -> Any:
-        """The preset, with what time alone allows; `small`, with a few frames and steps."""
+        """The preset, limited by time only, or by few frames and steps if `small`."""
         config = self.preset()
         if isinstance(config, ScanimateConfig):
             stages = {name: getattr(config, name) for name in ("skin", "cycle", "shape")}
@@ -92,7 +92,7 @@ def _configured(config: FitConfig, minutes: float, seed: int, small: bool) -> Fi
 
 def _template_weights() -> FitConfig:
     config = xa.quick()
-    return replace(config, skinning=replace(config.skinning, learned=False))
+    return replace(config, learn_skinning=False)
 
 
 METHODS: dict[str, Method] = {
@@ -104,7 +104,7 @@ METHODS: dict[str, Method] = {
     "SNARF, paper": Method(fit_snarf, snarf_paper, prepared=True),
     "SCANimate, paper": Method(fit_scanimate, scanimate_paper, prepared=True),
 }
-"""By the names they have in tables. Baselines without a word are in their size for two cores."""
+"""Methods by their names in tables. Baselines not named "paper" are sized for two cores."""
 
 
 def learn(
@@ -115,8 +115,8 @@ def learn(
     *,
     small: bool = False,
     cache: str | None = None,
-) -> tuple[Posable, dict[str, float]]:
-    """What a method gives, with its seconds and steps; nothing is compiled when it begins."""
+) -> tuple[Drivable, dict[str, float]]:
+    """Train a method without compiled programs; returns the model, its seconds and steps."""
     prepare(name, capture.body, seed, small=small, cache=cache)
     jax.clear_caches()
     clock = time.perf_counter()
@@ -129,14 +129,15 @@ def learn(
 def prepare(
     name: str, body: BodyModel, seed: int, *, small: bool = False, cache: str | None = None
 ) -> None:
-    """Fit a method's first fields into the cache folder, if they are to come from there."""
+    """Store a method's first fields in the cache folder, if it is `prepared`."""
     method = METHODS[name]
     if not method.prepared:
         return
     config = method.config(1.0, seed, small)
     if method.learn is xa.fit:
-        initial_fields(body, config, cache=cache)
+        mean_shape_model(body, config, cache=cache)
     elif method.learn is fit_snarf:
-        initial_fields(body_only(body), config, cache=cache)
+        mean_shape_model(body_only(body), config, cache=cache)
     else:
-        start_fields(body_only(body), config, cache=cache)
+        cut = body_only(body)
+        start_model(cut, np.zeros(cut.num_betas), config, cache=cache)

@@ -1,7 +1,7 @@
-"""What the metrics say of a mesh that is exactly right: their floor and their ceiling.
+"""Metrics of the ground truth against itself: the best scores that sampling allows.
 
-Question: both meshes of a comparison are sampled, each anew. What does the ground truth score
-against itself, with the 10,000 samples that the metrics take, and with more?
+Question: both meshes of a comparison are sampled independently. What does the ground truth score
+against itself, with the 10,000 samples of the metrics, and with more?
 
     python benchmarks/metric_floor.py [--frames N] [--json FILE]
 """
@@ -24,7 +24,7 @@ REGIONS = ("all", "hands", "face")
 
 
 def floor_row(frames: xa.Frames, samples: int) -> dict[str, Any]:
-    """Means over frames of every metric of a mesh against itself."""
+    """Mean over frames of every metric of a mesh against itself."""
     found: dict[str, list[float]] = {}
     for frame in frames:
         mesh = xa.Mesh(np.asarray(frame.vertices), np.asarray(frame.faces))
@@ -39,7 +39,7 @@ def floor_row(frames: xa.Frames, samples: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Metrics of the ground truth against itself.")
     parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--json", help="write header and rows to this file")
+    parser.add_argument("--json", help="JSON file for header and rows")
     parser.add_argument("--cache-dir")
     args = parser.parse_args()
     test = xa.synthetic_capture(args.cache_dir).test

@@ -1,11 +1,11 @@
-"""Part-aware against all-bone and body-only starts: cost, recall and accuracy.
+"""Part-aware, all-bone and body-only starts: cost, recall and accuracy.
 
-Question: what do part-aware starts (X-Avatar, section 3.3) save, and what do they lose, against
-starting every point's search from all 45 bones, or from the 9 of the body?
+Question: how much time do part-aware starts (X-Avatar, section 3.3) save, and how many roots do
+they lose, compared with starting from all 45 bones or from the 9 body bones?
 
-Same frames, same fields, same points for the three. The skinning field is the paper's network
-(5 x 128), fitted to the body's mean shape; roots are searched inside the training step, so that
-the search's share of a step is the method's own.
+All start sets use the same frames, fields and points. The skinning field is the paper's network
+(5 x 128), fitted to the body's mean shape. Roots are searched inside the training step, as in the
+paper, so the search takes its full share of a step.
 
     python benchmarks/part_aware_vs_all_bones.py [--quick] [--json FILE]
 """
@@ -26,28 +26,31 @@ from search_problems import (
     Problem,
     hits,
     known_points,
+    labelled_frames,
+    mean_shape_model,
     paper_config,
     recall,
+    stages_of,
 )
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import Avatar
 from xavatar_jax.body import canonical_vertices
 from xavatar_jax.correspondence import Roots, StartSet, search_field, start_table
+from xavatar_jax.fields import AvatarModel
+from xavatar_jax.learning import Schedule, train
+from xavatar_jax.methods.observations import subject_betas
+from xavatar_jax.methods.xavatar import FitConfig
+from xavatar_jax.methods.xavatar.roots import FrameData
 from xavatar_jax.report import describe_machine
 from xavatar_jax.sampling import varied_frames
-from xavatar_jax.training import AvatarFields, FitConfig, subject_betas
-from xavatar_jax.training.loop import train_pool
-from xavatar_jax.training.pool import FramePool, label_frames
-from xavatar_jax.training.prefit import initial_fields
-from xavatar_jax.training.progress import progress
 
 STARTS: tuple[StartSet, ...] = ("paper", "all_bones", "body")
 NAMES = {"paper": "part-aware", "all_bones": "all bones (A2)", "body": "body bones (A1)"}
 
 
 def benchmark_config(quick: bool, seed: int) -> FitConfig:
-    """The paper's skinning network and losses; a geometry field and counts for two cores."""
+    """The paper's skinning network and losses, with a geometry field and counts for two cores."""
     config = paper_config(seed, QUICK_PREFIT if quick else FULL_PREFIT)
     return replace(
         config,
@@ -56,7 +59,7 @@ def benchmark_config(quick: bool, seed: int) -> FitConfig:
         frames_per_step=2,
         points_per_step=400 if quick else 1000,
         search=replace(config.search, keep=3),
-        # The geometry here is on grids, which full rates do not harm from the first step.
+        # The geometry is on grids, which need no warm-up.
         optimiser=replace(config.optimiser, warmup=0),
     )
 
@@ -65,13 +68,13 @@ def capture_problems(avatar: Avatar, frames: xa.Frames, count: int, seed: int) -
     """Points near the person's canonical surface, posed by the field in each frame."""
     vertices = np.asarray(canonical_vertices(avatar.body, jnp.asarray(avatar.betas)))
     poses = [frame.params for frame in frames]
-    return known_points(avatar.body, avatar.fields.skinning, vertices, poses, count, seed)
+    return known_points(avatar.body, avatar.model.skinning, vertices, poses, count, seed)
 
 
 def measure_search(avatar: Avatar, problems: list[Problem], starts: StartSet) -> dict[str, Any]:
-    """Points a second and recall of the generating correspondence, on the network itself."""
-    table = start_table(avatar.body.tree, starts)
-    field = avatar.fields.skinning
+    """Points per second and recall of known correspondences, on the network."""
+    table = start_table(avatar.body, starts)
+    field = avatar.model.skinning
 
     def search(p: Problem) -> Roots:
         return search_field(field, p.x_d, p.parts, p.transforms, table)
@@ -94,34 +97,28 @@ def measure_search(avatar: Avatar, problems: list[Problem], starts: StartSet) ->
     }
 
 
-def train(
-    start: AvatarFields,
-    pool: FramePool,
+def learn(
+    start: AvatarModel,
+    data: FrameData,
     capture: Any,
     betas: np.ndarray,
     config: FitConfig,
     starts: StartSet,
-) -> tuple[dict[str, Any], list[tuple[float, int, AvatarFields]]]:
-    """Steps a second, and the fields as they were along the way, with seconds and steps."""
-    config = replace(config, search=replace(config.search, starts=starts), report_every=5)
-    way: list[tuple[float, int, AvatarFields]] = []
+) -> tuple[dict[str, Any], list[tuple[float, int, AvatarModel]]]:
+    """Steps per second, and snapshots of the model with their seconds and steps."""
+    config = replace(config, search=replace(config.search, starts=starts))
+    way: list[tuple[float, int, AvatarModel]] = []
     clock = [time.perf_counter()]
 
-    def keep(step: int, fields: AvatarFields, terms: dict[str, float]) -> None:
+    def keep(step: int, model: AvatarModel, terms: dict[str, float]) -> None:
         now = time.perf_counter()
-        way.append((now - clock[0], step, fields))
+        way.append((now - clock[0], step, model))
 
-    done = train_pool(
-        capture.body,
-        start,
-        pool,
-        betas,
-        config,
-        verbose=False,
-        callback=keep,
-    ).history
-    # Compilation ended before the first step that counts.
-    way = [(elapsed - done.seconds["compile"], step, fields) for elapsed, step, fields in way]
+    stages = stages_of(capture.body, betas, data, config)
+    schedule = Schedule(config.steps, seed=config.seed, report_every=5)
+    done = train(start, data, stages, schedule, verbose=False, callback=keep).history
+    # Exclude compilation.
+    way = [(elapsed - done.seconds["compile"], step, model) for elapsed, step, model in way]
     row = {
         "steps": done.steps_done,
         "train_steps_per_s": (done.steps_done - 1) / done.seconds["train"],
@@ -131,18 +128,18 @@ def train(
     return row, way
 
 
-def score(fields: AvatarFields, capture: Any, betas: np.ndarray, config: FitConfig, frames: int):
+def score(model: AvatarModel, capture: Any, betas: np.ndarray, config: FitConfig, frames: int):
     """Held-out Chamfer distances in mm, by region."""
-    avatar = Avatar(capture.body, betas, fields, config)
+    avatar = Avatar(capture.body, betas, model, config.spec)
     result = xa.evaluate(avatar, capture.test, num_frames=frames, verbose=False).mean.cd_mm
     return result.to_json()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Part-aware against all-bone starts.")
-    parser.add_argument("--quick", action="store_true", help="small: ends within five minutes")
-    parser.add_argument("--json", help="write header and rows to this file")
-    parser.add_argument("--steps", type=int, help="training steps of each run")
+    parser = argparse.ArgumentParser(description="Part-aware and all-bone starts.")
+    parser.add_argument("--quick", action="store_true", help="small run of less than five minutes")
+    parser.add_argument("--json", help="JSON file for header and rows")
+    parser.add_argument("--steps", type=int, help="number of training steps per run")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cache-dir")
     args = parser.parse_args()
@@ -151,19 +148,18 @@ def main() -> None:
     body = xa.synthetic_body(args.cache_dir)
     capture = xa.synthetic_capture(args.cache_dir, body=body)
     betas = subject_betas(capture.train)
-    start = initial_fields(body, config, cache=args.cache_dir)
+    start = mean_shape_model(body, config, cache=args.cache_dir)
     chosen = capture.train[varied_frames(capture.train.params, config.train_frames)]
-    with progress("points", len(chosen), verbose=True, unit="frame") as bar:
-        pool = label_frames(body, chosen, config, bar=bar)
-    avatar = Avatar(body, betas, start, config)
+    data = labelled_frames(body, chosen, config)
+    avatar = Avatar(body, betas, start, config.spec)
     problems = capture_problems(avatar, chosen[: 2 if args.quick else 6], 1200, args.seed)
     eval_frames = 2 if args.quick else 6
     rows: list[dict[str, Any]] = []
     budget = 0.0
     for starts in STARTS:
         row: dict[str, Any] = {"starts": NAMES[starts], **measure_search(avatar, problems, starts)}
-        trained, way = train(start, pool, capture, betas, config, starts)
-        # Equal time: what the part-aware run, which comes first, took for its steps.
+        trained, way = learn(start, data, capture, betas, config, starts)
+        # Equal time: the time of the part-aware run, which comes first.
         budget = budget or way[-1][0]
         in_time = [entry for entry in way if entry[0] <= budget] or way[:1]
         row |= trained

@@ -1,10 +1,10 @@
-"""What it costs not to know a point's part: recall where one part ends and another begins.
+"""Recall at the borders of parts, for points without a part label.
 
-Question: a point that was drawn around a vertex has that vertex's part, a point in space has none.
-Does a search from the parts that are near find its root as often, at wrists, neck and mouth?
+Question: a point sampled around a vertex has the part of the vertex; a point in space has no part.
+Does a search from the nearby parts find its root as often, at wrists, neck and mouth?
 
-Points lie around canonical vertices that have one of another part within 3 cm, and are carried by
-the tabulated network to bodies posed as in `correspondence.py`; so the root of each is known.
+Points are sampled around canonical vertices within 3 cm of another part. The tabulated network maps
+them to bodies posed as in `correspondence.py`, so the root of each point is known.
 
     python benchmarks/part_borders.py [--quick] [--json FILE]
 """
@@ -23,23 +23,22 @@ from scipy.spatial import cKDTree
 from search_problems import FULL_PREFIT, NOISE_M, QUICK_PREFIT, carry, hard_pose, hits, paper_field
 
 import xavatar_jax as xa
-from xavatar_jax.body import BODY, EYES_MOUTH, FACE, LEFT_HAND, RIGHT_HAND
 from xavatar_jax.correspondence import RowFinder, search_grid, start_table
-from xavatar_jax.correspondence.nearby import NEAR
+from xavatar_jax.correspondence.starts import NEAR
 from xavatar_jax.fields import grid_vertices, pose_grid
 from xavatar_jax.report import describe_machine
 
 BORDERS = {
-    "wrists": ((BODY,), (LEFT_HAND, RIGHT_HAND)),
-    "neck and head": ((BODY,), (FACE,)),
-    "mouth and eyes": ((FACE,), (EYES_MOUTH,)),
+    "wrists": (("body",), ("left_hand", "right_hand")),
+    "neck and head": (("body",), ("face",)),
+    "mouth and eyes": (("face",), ("eyes_mouth",)),
 }
 
 
 def at_border(
     vertices: np.ndarray, labels: Int[np.ndarray, " V"], one: tuple, other: tuple
 ) -> Bool[np.ndarray, " V"]:
-    """Vertices of either side with one of the other side near."""
+    """Vertices of either side that are near the other side."""
     near = np.zeros(len(vertices), bool)
     for own, across in ((one, other), (other, one)):
         rows = np.flatnonzero(np.isin(labels, own))
@@ -50,8 +49,8 @@ def at_border(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Recall at the borders of parts.")
-    parser.add_argument("--quick", action="store_true", help="small: ends within a minute or two")
-    parser.add_argument("--json", help="write header and rows to this file")
+    parser.add_argument("--quick", action="store_true", help="small run of a minute or two")
+    parser.add_argument("--json", help="JSON file for header and rows")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cache-dir")
     args = parser.parse_args()
@@ -61,14 +60,15 @@ def main() -> None:
     vertices, labels = grid_vertices(body), np.asarray(body.part_labels)
     mlp = paper_field(body, steps, cache=args.cache_dir)
     field = tabulated(body, vertices, mlp, grid_mm, 1).grid
-    pairs, full = start_table(body.tree, pairs=True), start_table(body.tree, "full")
+    pairs, full = start_table(body, pairs=True), start_table(body, "full")
     pose, rows = jax.jit(pose_grid), []
     for degrees in (20.0, 40.0):
         for name, sides in BORDERS.items():
             rng = np.random.default_rng([args.seed, 6])
             found: dict[str, list[np.ndarray]] = {}
             lanes: dict[str, int] = {}
-            spots = np.flatnonzero(at_border(vertices, labels, *sides))
+            one, other = (tuple(map(body.parts.index, side)) for side in sides)
+            spots = np.flatnonzero(at_border(vertices, labels, one, other))
             for _ in range(frames):
                 params = xa.BodyParams.create(body, pose=hard_pose(body, rng, degrees))
                 transforms = jnp.asarray(xa.bone_transforms(body, params), jnp.float32)
@@ -81,7 +81,7 @@ def main() -> None:
                 for rule, row, table in (
                     ("its own part", labels[chosen], pairs),
                     ("part of the nearest vertex", nearest, pairs),
-                    ("the parts within 3 cm", RowFinder(posed, labels)(np.asarray(x_d)), pairs),
+                    ("the parts within 3 cm", RowFinder(posed, body.parts)(np.asarray(x_d)), pairs),
                     ("full", labels[chosen], full),
                 ):
                     roots = search_grid(grid, x_d, jnp.asarray(row, jnp.int32), transforms, table)

@@ -1,7 +1,7 @@
-"""Tables that take hours: each row is written as its run ends, and a second call goes on.
+"""Tables that take hours: rows are written as runs finish, and a second call continues.
 
-A job is the keyword arguments of one run, `{"name": ..., "seed": ..., more}`; a run gives the
-figures of its row; a row is both together. What is finished is told by the job.
+A job holds the keyword arguments of one run, `{"name": ..., "seed": ..., more}`. A run returns
+metrics. A row combines both, and a job is finished if the file has a row with its entries.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import jax
 from measuring import print_rows
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Posable
+from xavatar_jax.avatar import Drivable
 from xavatar_jax.frames import Frames
 from xavatar_jax.report import describe_machine, write_json
 
@@ -39,21 +39,21 @@ def add_options(
     seeds: int = 3,
     eval_frames: int = 12,
 ) -> None:
-    """The options that all such tables share; several `minutes` make a list of it."""
+    """Add the options shared by these tables; a sequence of `minutes` makes `--minutes` a list."""
     several = not isinstance(minutes, float | int)
-    parser.add_argument("--quick", action="store_true", help="small: to see that it runs")
-    parser.add_argument("--json", help="keep the table in this file, and go on with one that is")
+    parser.add_argument("--quick", action="store_true", help="small test run")
+    parser.add_argument("--json", help="JSON file of the table; continues an existing one")
     parser.add_argument("--only", nargs="+", choices=list(names), metavar="NAME", help="of "
                         + ", ".join(names))  # fmt: skip
-    parser.add_argument("--seeds", type=int, default=seeds, help="how many, from 0")
+    parser.add_argument("--seeds", type=int, default=seeds, help="number of seeds, from 0")
     parser.add_argument("--minutes", type=float, default=minutes, nargs="+" if several else None,
-                        help="a run, from its call")  # fmt: skip
+                        help="minutes per run, from its call")  # fmt: skip
     parser.add_argument("--eval-frames", type=int, default=eval_frames, help="held-out frames")
     parser.add_argument("--cache-dir")
 
 
 def read_options(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """What was asked for; `--quick` decides how small it is, the same for all such tables."""
+    """Parsed options; `--quick` sets the size of a small run, the same for all tables."""
     args = parser.parse_args()
     if args.quick:
         args.seeds, args.eval_frames = 1, 1
@@ -62,7 +62,7 @@ def read_options(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def every(**values: Iterable[Any]) -> list[dict[str, Any]]:
-    """A job for each combination; the last entry changes fastest."""
+    """One job per combination; the last entry changes fastest."""
     return [dict(zip(values, row, strict=True)) for row in product(*values.values())]
 
 
@@ -77,13 +77,13 @@ def fill(
     columns: Sequence[str] = (),
     known: Sequence[Row] = (),
 ) -> tuple[dict[str, Any], list[Row]]:
-    """Header and rows of the table: `run(**job)` for each job that the file does not have yet.
+    """Header and rows of the table: calls `run(**job)` for each job that is not in the file.
 
-    `settings` are what all rows share (minutes, frames): a file with others, or of another
-    machine, is refused. `known` are rows of runs made elsewhere, which are not made again. A run
-    that fails is reported, and left for the next call; the others go on. Every run begins with
-    nothing compiled, so that none has the advantage of coming later. At the end the medians are
-    printed: see `print_medians` for `by` and `columns`.
+    `settings` are shared by all rows (minutes, frames); a file with other settings or from another
+    machine is rejected. `known` are rows of other tables that are reused. A failed run is
+    reported and repeated by the next call; other runs continue. Compiled programs are dropped
+    before every run, so that later runs have no advantage. Finally the medians are printed: see
+    `print_medians` for `by` and `columns`.
 
     **Raises:** `ValueError` naming the file and what differs; `SystemExit` at the end if a run
     failed.
@@ -130,9 +130,9 @@ def fill(
 
 
 def rows_of(file: Path, header: Mapping[str, Any], same: Iterable[str]) -> list[Row]:
-    """Rows of a table that was begun, if it is this one.
+    """Rows of an existing table with the same header.
 
-    **Raises:** `ValueError` naming the file and in which of `same` its header differs.
+    **Raises:** `ValueError` naming the file and the entries of `same` that differ.
     """
     known = json.loads(file.read_text(encoding="utf-8"))
     other = [
@@ -146,7 +146,7 @@ def rows_of(file: Path, header: Mapping[str, Any], same: Iterable[str]) -> list[
 
 
 def medians(rows: Sequence[Row], by: Sequence[str] = ("name",)) -> list[Row]:
-    """A row for each different `by`, in their order: medians over seeds, and how many there are."""
+    """Medians and number of seeds, one row per distinct `by`, in order of appearance."""
     groups: dict[tuple, list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in by), []).append(row)
@@ -161,7 +161,7 @@ def medians(rows: Sequence[Row], by: Sequence[str] = ("name",)) -> list[Row]:
 
 
 def _figures(rows: Sequence[Row], by: Sequence[str]) -> list[str]:
-    """Names of what are numbers in some row."""
+    """Names of entries that are numbers in some row."""
     names = {name: None for row in rows for name, value in row.items() if _is_number(value)}
     return [name for name in names if name not in (*by, "seed")]
 
@@ -178,14 +178,14 @@ def _is_number(value: Any) -> bool:
 def print_medians(
     rows: Sequence[Row], by: Sequence[str] = ("name",), columns: Sequence[str] = ()
 ) -> None:
-    """The medians as a plain table: `by`, then `columns` (else every figure)."""
+    """Print the medians as a table: `by`, then `columns` (default: all metrics)."""
     found = medians(rows, by)
     if found:
         print_rows(found, [*by, "seeds", *(columns or _figures(found, (*by, "seeds")))])
 
 
-def score(model: Posable, frames: Frames, count: int) -> dict[str, float | None]:
-    """Held-out figures of `xa.evaluate`, named by figure and region: `cd_hands_mm` and so on."""
+def score(model: Drivable, frames: Frames, count: int) -> dict[str, float | None]:
+    """Held-out metrics of `xa.evaluate`, named by metric and region: `cd_hands_mm` and so on."""
     mean = xa.evaluate(model, frames, num_frames=count, verbose=False).mean.to_json()
     found = {}
     for figure in ("cd_mm", "cd_max_mm", "nc", "iou", "iou_box"):
@@ -196,6 +196,6 @@ def score(model: Posable, frames: Frames, count: int) -> dict[str, float | None]
 
 
 def _plain(value: Any) -> Any:
-    """A JSON value: what is not finite becomes null."""
+    """A JSON value; non-finite numbers become null."""
     value = value.item() if hasattr(value, "item") else value
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,7 +1,7 @@
-"""Poses in which a body touches itself, and posed points with all their canonical ones.
+"""Poses in which a body touches itself, and posed points with all their canonical points.
 
-The canonical points are found without any of the library's searches: canonical points all through
-the body are posed, and Newton's method starts at those that come to lie around a posed point.
+The canonical points are found independently of the library's searches: points throughout the body
+are posed, and Newton's method starts from those that end up close to a given posed point.
 """
 
 from __future__ import annotations
@@ -17,27 +17,26 @@ from jaxtyping import Array, Bool, Float, Int
 from search_problems import carry
 
 import xavatar_jax as xa
-from xavatar_jax.body import LEFT_HAND, PARTS, RIGHT_HAND, BodyModel, canonical_joints
-from xavatar_jax.correspondence import PAIR_ROWS
-from xavatar_jax.correspondence.implicit import MIN_DETERMINANT
+from xavatar_jax.body import BodyModel, canonical_joints
+from xavatar_jax.correspondence import MIN_DETERMINANT, pair_rows
 from xavatar_jax.fields import AbstractSkinningField, PartGrids, skin_with_jacobian
 from xavatar_jax.geometry import vertex_normals
 from xavatar_jax.kinematics import determinant_3x3, skin_points, solve_3x3
 from xavatar_jax.sampling import signed_distance
 
-NEAR_PART_M = 0.03  # a point this close to two parts takes the starts of both
-OUTSIDE_M = 0.01  # canonical points that count lie inside the body, or at most this far outside
-APART_M = 0.02  # two canonical points this far apart are two places, not one found twice
+NEAR_PART_M = 0.03  # a point this close to two parts uses the starts of both
+OUTSIDE_M = 0.01  # canonical points further outside the body are ignored
+APART_M = 0.02  # minimum distance of two distinct canonical points
 TOUCHING_M = 0.004
-LEAST_POINTS = 10  # fewer would say nothing
-PRESSED_M = 0.003  # how deep skin gives way where it touches, on either side
+LEAST_POINTS = 10  # minimum for meaningful statistics
+PRESSED_M = 0.003  # indentation of the skin on each side of a contact
 
 
 class Contact(NamedTuple):
-    """Q posed points with R canonical ones each, where `known`; labels and nearest parts.
+    """Q posed points with up to R canonical points each (`known`), their labels and nearest parts.
 
-    `upright`: known, and the field's map keeps its orientation there. Between fingers that bend far
-    it turns space inside out: such points solve the equations and are no place of the body.
+    `upright` marks known points where the map preserves orientation. Between strongly bent fingers
+    it turns space inside out; such points solve the equations but do not belong to the body.
     """
 
     name: str
@@ -53,7 +52,7 @@ class Contact(NamedTuple):
 def contact_poses(
     body: BodyModel, vertices: Float[np.ndarray, "V 3"], names: Sequence[str]
 ) -> dict[str, xa.BodyParams]:
-    """Left hand on left thigh, palms together, fists: by least squares on a few vertices."""
+    """Poses for hand on thigh, palms together and fists, by least squares on a few vertices."""
     joints = np.asarray(canonical_joints(body, jnp.zeros(0)))
     normals = vertex_normals(vertices, np.asarray(body.faces))
     labels = np.asarray(body.part_labels)
@@ -61,21 +60,21 @@ def contact_poses(
     joint = lambda name: joints[index(name)]  # noqa: E731
 
     def facing(place: np.ndarray, direction: int, sign: int, part: int) -> int:
-        """The vertex of a part nearest to a place, with its normal along an axis."""
+        """Index of the vertex of a part closest to `place` whose normal points along an axis."""
         fits = (labels == part) & (sign * normals[:, direction] > 0.6)
         return int(np.where(fits, np.linalg.norm(vertices - place, axis=1), np.inf).argmin())
 
     def palm(side: str) -> list[int]:
-        """Centre, towards the fingers, towards the thumb; palms look down in canonical space."""
-        part = LEFT_HAND if side == "left" else RIGHT_HAND
+        """Vertices at the centre of a palm, towards the fingers and the thumb; palms face down."""
+        part = body.parts.index(f"{side}_hand")
         wrist, knuckle = joint(f"{side}_wrist"), joint(f"{side}_middle1")
         centre = 0.4 * wrist + 0.6 * knuckle
         places = (centre, knuckle, centre + np.array([0, 0, 0.02]))
         return [facing(place, 1, -1, part) for place in places]
 
     def pads(side: str) -> tuple[list[int], list[int]]:
-        """Tips of four fingers, and where on the palm they go."""
-        part = LEFT_HAND if side == "left" else RIGHT_HAND
+        """Vertices of four fingertips, and their targets on the palm."""
+        part = body.parts.index(f"{side}_hand")
         wrist, tips, goals = joint(f"{side}_wrist"), [], []
         for finger in ("index", "middle", "ring", "pinky"):
             first, last = joint(f"{side}_{finger}1"), joint(f"{side}_{finger}3")
@@ -119,7 +118,7 @@ class _Reach(NamedTuple):
     def __call__(
         self, moving: list[str], pose: np.ndarray, these: list[int], those: list[int]
     ) -> xa.BodyParams:
-        """Turn joints until vertices meet, with as little turning as that takes."""
+        """Rotate joints until vertices meet, with a penalty on the rotations."""
         from scipy.optimize import least_squares
 
         rows = np.array([*these, *those])
@@ -156,10 +155,10 @@ class _Reach(NamedTuple):
 def inner_nodes(
     body: BodyModel, vertices: Float[np.ndarray, "V 3"], grids: PartGrids
 ) -> list[Float[np.ndarray, "N 3"]]:
-    """Nodes inside the body or just outside, of each grid."""
+    """Nodes of each grid inside the body or just outside."""
     nodes = np.asarray(grids.nodes, np.float64)
     sizes = np.asarray(grids.spacing)
-    # Each grid's nodes stand in a row.
+    # Nodes are stored grid by grid.
     cells = np.asarray(grids.cells)
     dense = np.append(np.asarray(grids.offset), len(np.asarray(grids.index)))
     own = []
@@ -174,7 +173,7 @@ def inner_nodes(
 def _newton(
     field: AbstractSkinningField, start: Array, target: Array, transforms: Array
 ) -> tuple[Array, Array, Array]:
-    """Where thirty Newton steps lead from each start: points, residuals, determinants."""
+    """Thirty Newton steps from each start: points, residuals and determinants."""
 
     def one(args: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         start, target = args
@@ -203,20 +202,20 @@ def contact_points(
     count: int,
     seed: int,
 ) -> Contact:
-    """Points of a hand that lie where other canonical points lie too, and all of those.
+    """Posed points of a hand that coincide with other canonical points, and all of those.
 
-    **Raises:** `ValueError` if the pose brings too few such points together.
+    **Raises:** `ValueError` if the pose has too few such points.
     """
     from scipy.spatial import KDTree
 
     rng = np.random.default_rng([seed, 2])
     transforms = jnp.asarray(xa.bone_transforms(body, params), jnp.float32)
     labels = np.asarray(body.part_labels)
-    hand = rng.choice(np.flatnonzero(labels == LEFT_HAND), 60 * count)
+    hand = rng.choice(body.parts.rows("left_hand"), 60 * count)
     own = (vertices[hand] + 0.004 * rng.standard_normal((len(hand), 3))).astype(np.float32)
     posed = np.asarray(carry(field, jnp.asarray(own), transforms))
     trees = [KDTree(np.asarray(carry(field, jnp.asarray(n), transforms))) for n in nodes]
-    # What touches: a node that lies here when posed, and elsewhere in canonical space.
+    # In contact: some posed node is close, but far away in canonical space.
     touching = np.zeros(len(own), bool)
     for canonical, tree in zip(nodes, trees, strict=True):
         gap, near = tree.query(posed, k=12, distance_upper_bound=2 * TOUCHING_M)
@@ -228,7 +227,7 @@ def contact_points(
     starts, targets = [], []
     for canonical, tree in zip(nodes, trees, strict=True):
         gap, near = tree.query(posed, k=8, distance_upper_bound=0.02)
-        # Those out of reach start at the nearest: arrays keep one shape.
+        # Fill up with the nearest node, so that arrays keep their shape.
         near = np.where(np.isfinite(gap), near, np.asarray(tree.query(posed)[1])[:, None])
         starts.append(canonical[near])
         targets.append(np.repeat(posed[:, None], 8, 1))
@@ -263,7 +262,7 @@ def contact_points(
             KDTree(surface[labels == part]).query(x_d)[0]
             if (labels == part).any()
             else np.full(len(x_d), np.inf)
-            for part in range(len(PARTS))
+            for part in range(len(body.parts.table))
         ],
         axis=1,
     )
@@ -277,7 +276,7 @@ def contact_points(
         known[chosen],
         upright[chosen],
         order[:, 0].astype(np.int32),
-        PAIR_ROWS[order[:, 0], second].astype(np.int32),
+        pair_rows(len(body.parts.table))[order[:, 0], second].astype(np.int32),
         transforms,
     )
 
@@ -285,7 +284,7 @@ def contact_points(
 def _distinct(
     x: np.ndarray, det: np.ndarray, good: np.ndarray, most: int = 8
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of candidates `(Q, C, 3)` those that are good and no repetition, up to `most`."""
+    """Up to `most` good and distinct candidates of `(Q, C, 3)`."""
     points, known = np.zeros((len(x), most, 3), np.float32), np.zeros((len(x), most), bool)
     turned = np.zeros((len(x), most), np.float32)
     for q in range(len(x)):
@@ -299,7 +298,7 @@ def _distinct(
 
 
 def _spread(points: np.ndarray) -> float:
-    """The largest distance between two of some points."""
+    """Largest distance between any two points."""
     if len(points) < 2:
         return 0.0
     return float(np.linalg.norm(points[:, None] - points[None], axis=-1).max())
@@ -311,7 +310,7 @@ def root_shares(
     rows: Int[np.ndarray, " Q"],
     within_m: float = 1e-4,
 ) -> dict[str, float]:
-    """Shares of points all of whose canonical ones a search finds, and of those it finds."""
+    """Share of points with all roots found, and share of roots found."""
     x_c, valid = search(jnp.asarray(contact.x_d), jnp.asarray(rows), contact.transforms)
     gap = np.linalg.norm(contact.x_c[:, :, None] - x_c[:, None], axis=-1)
     found = np.where(valid[:, None], gap, np.inf).min(-1) < within_m

@@ -1,16 +1,16 @@
-"""What each part of the method is worth: the paper's ablations at equal time.
+"""The paper's ablations at equal time.
 
-Question: how far does the held-out accuracy fall, of hands above all, if every search starts at
-the body's bones (A1) or at all bones (A2), if points are drawn without regard to parts (A3), or
-if nothing holds the weights at the surface (A4)? And if the template's weights are kept as they
-are?
+Question: how much held-out accuracy is lost, especially on the hands, if every search starts from
+the body bones (A1) or from all bones (A2), if points are sampled without regard to parts (A3), or
+if there is no loss on the skinning weights at the surface (A4)? And if the template's weights are
+kept fixed?
 
-Every row is a run of `xa.fit` of so many minutes from its call, on the bundled capture. Settings:
+Each row is a run of `xa.fit` with a time limit, on the bundled capture. Settings:
 
 - `quick`: the preset, with roots that are found once and polished.
 - `mlp`: the paper's skinning network, fitted to the mean shape's weights first; roots are searched
   in every step, with a guide, on fewer points.
-- `mlp-random`: the same with the network as it was drawn.
+- `mlp-random`: as `mlp`, with random initial weights.
 
     python benchmarks/table1_ablations.py --json table1.json [--settings NAME...] [--only NAME...]
 """
@@ -26,14 +26,13 @@ import equinox as eqx
 import jax
 from measuring import least_time
 from resumable import Row, add_options, every, fill, medians, read_options, score
+from search_problems import labelled_frames, mean_shape_model, stages_of
 
 import xavatar_jax as xa
-from xavatar_jax.training import ABLATIONS, FitConfig, initial_fields
-from xavatar_jax.training.config import has_guide
-from xavatar_jax.training.objective import search_batch
-from xavatar_jax.training.pool import label_frames, tabulate_for_search
-from xavatar_jax.training.progress import progress
-from xavatar_jax.training.step import draw_batch
+from xavatar_jax.fields import grids_for_search
+from xavatar_jax.methods.xavatar import FitConfig
+from xavatar_jax.methods.xavatar.config import ABLATIONS
+from xavatar_jax.methods.xavatar.upkeep import GuideRenewal
 
 NAMES = ("complete", *ABLATIONS, "fixed")
 SETTINGS = ("quick", "mlp", "mlp-random")
@@ -44,7 +43,7 @@ COLUMNS = (
 
 
 def setting_config(setting: str, minutes: float) -> FitConfig:
-    """The complete method in a setting."""
+    """Config of the complete method in a setting."""
     config = replace(xa.quick(), minutes=minutes, steps=20_000)
     if setting == "quick":
         return config
@@ -55,7 +54,7 @@ def setting_config(setting: str, minutes: float) -> FitConfig:
         points_per_step=500,
         frames_per_minute=30,
         prefit_steps=4000 if start == "template" else config.prefit_steps,
-        settle_steps=4000,
+        weights_steps=4000,
         skinning=replace(config.skinning, kind="mlp", start=start),
         search=replace(config.search, cached=False, guide_every=50),
         losses=replace(config.losses, surface_points=512),
@@ -65,42 +64,39 @@ def setting_config(setting: str, minutes: float) -> FitConfig:
 
 
 def small(config: FitConfig) -> FitConfig:
-    """The same in a minute or so, to see that it runs."""
-    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=60, settle_steps=20)
+    """A test run of about a minute."""
+    return replace(config, minutes=None, steps=6, train_frames=3, prefit_steps=60, weights_steps=20)
 
 
 def change(config: FitConfig, name: str) -> FitConfig:
-    """The config with one thing changed."""
+    """Config of one ablation."""
     if name == "fixed":
-        return replace(config, skinning=replace(config.skinning, learned=False))
+        return replace(config, learn_skinning=False)
     return ABLATIONS[name](config) if name in ABLATIONS else config
 
 
 def search_seconds(result: Any, capture: Any, config: FitConfig) -> float:
-    """Seconds that the search of one step takes, on the fields that were learned."""
-    avatar = result.avatar
-    frames = result.frames[: config.frames_per_step]
-    with progress("points", len(frames), verbose=False) as bar:
-        pool = label_frames(capture.body, frames, config, bar=bar)
-    config = replace(config, points_per_step=min(config.points_per_step, pool.points.shape[1]))
-    batch = draw_batch(pool, config, config.points_per_step, 0, jax.random.key(config.seed))
-    skinning, guide = avatar.fields.skinning, None
-    if has_guide(config):
-        guide = tabulate_for_search(capture.body, avatar.betas, skinning, config)
-    search = eqx.filter_jit(lambda s, g, b: search_batch(s, g, b, config, capture.body.tree))
-    least_time(lambda: search(skinning, guide, batch), 1)
-    return least_time(lambda: search(skinning, guide, batch), 3)[1]
+    """Seconds to draw one step's points and search their roots, on the learned fields."""
+    avatar, body = result.avatar, capture.body
+    data = labelled_frames(body, result.frames[: config.frames_per_step], config)
+    if config.search.guide_every:
+        grids = grids_for_search(avatar.model.skinning, body, avatar.betas, config.search.grid)
+        data = GuideRenewal(grids, 1)(avatar.model, data, 0)
+    (stage,) = stages_of(body, avatar.betas, data, config)
+    draw, key = eqx.filter_jit(stage.draw), jax.random.key(config.seed)
+    least_time(lambda: draw(avatar.model, data, key), 1)
+    return least_time(lambda: draw(avatar.model, data, key), 3)[1]
 
 
 def measure(
     name: str, setting: str, seed: int, *, capture: Any, args: argparse.Namespace
 ) -> dict[str, Any]:
-    """Figures of one run."""
+    """Metrics of one run."""
     config = setting_config(setting, args.minutes)
     config = change(small(config) if args.quick else config, name)
     config = replace(config, seed=seed)
-    # The first fields are the same for all, and are not what is compared: they are made before.
-    initial_fields(capture.body, config, cache=args.cache_dir)
+    # All runs share the first fields, so they are cached before the clock starts.
+    mean_shape_model(capture.body, config, cache=args.cache_dir)
     result = xa.fit(capture.train, config, cache=args.cache_dir, verbose=False)
     history, avatar = result.history, result.avatar
     seconds = history.seconds
@@ -125,7 +121,7 @@ def measure(
 
 
 def compare(rows: Sequence[Row]) -> list[str]:
-    """A sentence on each ablation beside the complete method, by setting; medians over seeds."""
+    """Ablations relative to the complete method, one line each; medians over seeds."""
     said = []
     found = medians(rows, ("setting", "name"))
     for setting in SETTINGS:
@@ -134,7 +130,7 @@ def compare(rows: Sequence[Row]) -> list[str]:
         if whole is None:
             continue
         for name, row in own.items():
-            words = [f"{setting}, {name} beside complete:"]
+            words = [f"{setting}, {name} relative to complete:"]
             for region in ("all", "hands", "face"):
                 key = f"cd_{region}_mm"
                 if whole.get(key) and row.get(key):
@@ -154,7 +150,7 @@ def main() -> None:
     settings = args.settings or (("quick",) if args.quick else SETTINGS)
     capture = xa.synthetic_capture(args.cache_dir)
     jobs = every(seed=range(args.seeds), setting=settings, name=names)
-    # Weights that started at random have nothing to be kept at.
+    # Random initial weights cannot be kept fixed.
     jobs = [j for j in jobs if j["name"] != "fixed" or not j["setting"].endswith("random")]
     _, rows = fill(
         jobs,

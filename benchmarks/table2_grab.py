@@ -1,15 +1,15 @@
-"""X-Avatar's comparison on GRAB: ours, SNARF and SCANimate at equal time.
+"""X-Avatar's comparison on GRAB: this library, SNARF and SCANimate at equal time.
 
-Question: how near are avatars of each method to meshes of motion that none has seen, when each
-learns for the same minutes?
+Question: how close are the avatars of each method to meshes of held-out motion, after the same
+training time?
 
     python benchmarks/table2_grab.py [--quick] [--json FILE] [--data FOLDER --body FILE]
 
-The bundled capture, unless GRAB's own is given. SNARF and SCANimate are driven by a body-only
-skeleton, as in the paper (its Table 2); `template weights` is ours with the skinning weights of
-the body, not learned. All begin with fields fitted to the body's mean shape, which is part of the
-minutes (but for `paper` and the baselines in their papers' size, which `--only` adds). A row is
-written as its run ends, and the same command goes on from there.
+The data are the bundled capture, or a subject of GRAB if given. SNARF and SCANimate use a body-only
+skeleton, as in the paper (Table 2). `template weights` is our method with the fixed skinning
+weights of the body. All methods start from fields fitted to the body's mean shape, and the time
+includes this fit (except for `paper` and the paper-sized baselines, which `--only` adds). Rows are
+written as runs finish, and the same command continues a stopped table.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from methods import METHODS, learn
 from resumable import add_options, every, fill, read_options, score
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Posable
+from xavatar_jax.avatar import Drivable
 from xavatar_jax.frames import spread
 
 NAMES = ("quick", "template weights", "SNARF", "SCANimate")
@@ -37,8 +37,8 @@ COLUMNS = (
 )
 
 
-def measure_speed(model: Posable, frames: xa.Frames) -> float:
-    """Milliseconds of a mesh in a new pose, once the canonical surface is there."""
+def measure_speed(model: Drivable, frames: xa.Frames) -> float:
+    """Milliseconds per mesh in a new pose, once the canonical surface is extracted."""
     model.mesh(frames[0].params)
     clock = time.perf_counter()
     for k in range(1, len(frames)):
@@ -51,8 +51,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     add_options(parser, METHODS, minutes=3.0)
-    parser.add_argument("--data", help="a subject's folder, as examples/fit_grab.py takes it")
-    parser.add_argument("--body", help="the body model of --data")
+    parser.add_argument("--data", help="folder of a subject, as for examples/fit_grab.py")
+    parser.add_argument("--body", help="body model of --data")
     args = read_options(parser)
     body = xa.load_body(args.body) if args.body else xa.synthetic_body(args.cache_dir)
     if args.data:
@@ -74,7 +74,7 @@ def main() -> None:
     fill(
         every(name=args.only or NAMES, seed=range(args.seeds)),
         run,
-        question="held-out accuracy of ours and the baselines at equal time",
+        question="held-out accuracy of our method and the baselines at equal time",
         settings={
             "quick": args.quick,
             "minutes": args.minutes,

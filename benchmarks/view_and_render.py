@@ -1,4 +1,4 @@
-"""Times of pictures and of the viewer, for one avatar; and the pictures of docs/view-and-render.md.
+"""Time of rendering and of the viewer for one avatar; draws the images of docs/view-and-render.md.
 
 python benchmarks/view_and_render.py out/fit_grab/avatar.npz
 python benchmarks/view_and_render.py out/fit_grab/avatar.npz --pictures docs/pictures
@@ -34,7 +34,7 @@ from xavatar_jax.report import describe_machine
 
 
 def clock(work: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
-    """Least wall time and least processor time of a few calls after a first one, seconds."""
+    """Minimum wall and CPU time of several calls after a warm-up call, seconds."""
     work()
     times = []
     for _ in range(repeats):
@@ -49,7 +49,7 @@ def row(what: str, seconds: float, processor: float | None = None) -> dict[str, 
 
 
 def picture_rows(mesh: xa.Mesh) -> list[dict[str, Any]]:
-    """Pictures of one mesh: normals, rays and shadows are computed anew for each."""
+    """Images of one mesh, with normals, rays and shadows recomputed for each."""
     bare, rows = replace(mesh, normals=None), []
     for name, size, ground in (
         ("512 x 512", (512, 512), False),
@@ -58,13 +58,13 @@ def picture_rows(mesh: xa.Mesh) -> list[dict[str, Any]]:
     ):
         camera = frame_view(mesh.vertices, "three_quarter", aspect=size[0] / size[1])
         taken = clock(lambda c=camera, s=size, g=ground: render_mesh(bare, c, s, ground=g))
-        rows.append(row(f"picture, {name}", *taken))
+        rows.append(row(f"image, {name}", *taken))
     wall, processor = clock(lambda: turntable(bare, 8, (1920, 1080)), 2)
-    return [*rows, row("turntable of 1920 x 1080, a picture of 8", wall / 8, processor / 8)]
+    return [*rows, row("turntable, 1920 x 1080, per image of 8", wall / 8, processor / 8)]
 
 
 def viewer_rows(avatar: xa.Avatar, frames: xa.Frames) -> list[dict[str, Any]]:
-    """From the call to the page, and from a slider to the new mesh on its way to the browser."""
+    """Time from call to page and to avatar, and from a slider to sending the new mesh."""
     begun = time.perf_counter()
     with xa.view(avatar, frames=frames, verbose=False) as viewer:
         urllib.request.urlopen(viewer.url).read()
@@ -82,17 +82,17 @@ def viewer_rows(avatar: xa.Avatar, frames: xa.Frames) -> list[dict[str, Any]]:
 
         moved = clock(slide, 20)
     return [
-        row("viewer, from the call to the page", page),
-        row("viewer, from the call to the avatar, whose surface is extracted and kept", shown),
-        row("viewer, from a slider to the moved mesh on its way to the browser", *moved),
+        row("viewer, from call to page", page),
+        row("viewer, from call to avatar (includes extracting the surface)", shown),
+        row("viewer, from slider to sending the moved mesh", *moved),
     ]
 
 
 def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> None:
-    """Four ways to look at one frame."""
+    """Draw one frame in four shadings, and a turntable."""
     camera = frame_view(mesh.vertices, "three_quarter", aspect=0.62)
     distance, _, _ = closest_points(frame.vertices, frame.faces, mesh.vertices)
-    weights = weight_colors(np.asarray(avatar.neutral_surface.weights).T)
+    weights = weight_colors(np.asarray(avatar.rest.weights).T)
     ways = {
         "color": (mesh, "color"),
         "normal": (mesh, "normal"),
@@ -114,9 +114,9 @@ def draw(avatar: xa.Avatar, frame: xa.Frame, mesh: xa.Mesh, folder: Path) -> Non
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("avatar", type=Path)
-    parser.add_argument("--pictures", type=Path, help="folder to draw into")
-    parser.add_argument("--no-viewer", action="store_true", help="measure pictures alone")
-    parser.add_argument("--json", help="write the figures to this file")
+    parser.add_argument("--pictures", type=Path, help="output folder of images")
+    parser.add_argument("--no-viewer", action="store_true", help="measure rendering only")
+    parser.add_argument("--json", help="JSON file for the results")
     options = parser.parse_args()
     avatar = xa.load_avatar(options.avatar)
     frames = xa.synthetic_capture(body=avatar.body).test.sequences["signs_and_piano"]
@@ -128,7 +128,7 @@ def main() -> None:
     rows = [*picture_rows(mesh), *rows]
     print_rows(rows, ("what", "seconds", "processor_s"))
     header = {
-        "question": "seconds of pictures and of the viewer",
+        "question": "seconds of rendering and of the viewer",
         **describe_machine(),
         "vertices": mesh.num_vertices,
     }

@@ -13,13 +13,14 @@ import pytest
 from helpers import COLUMNS, PARENTS, toy_arrays
 from toy_smplx import write_toy_body
 
-from xavatar_jax.body import load_body, synthetic_body
+from xavatar_jax.body import load_body
+from xavatar_jax.synthetic import synthetic_body
 
 # What takes longest begins.
-_FIRST = ("avatar", "training", "baselines", "viewer")
+_FIRST = ("avatar", "xavatar", "methods", "viewer")
 _SHORT_RUNS = (
-    *("baselines", "body", "correspondence", "fields", "kinematics", "losses", "motion"),
-    *("report", "sampling", "training"),
+    *("body", "correspondence", "fields", "kinematics", "learning", "methods", "motion"),
+    *("report", "sampling", "xavatar"),
 )
 _MAPS = 20_000  # of the 65,530 that Linux grants; a thousand programs need about as many
 

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
 from scipy.spatial.transform import Rotation
 
+import xavatar_jax
 from xavatar_jax.body import SMPL_TREE, SMPLH_TREE, SMPLX_TREE, mano_tree
 from xavatar_jax.fields import AbstractSkinningField
 
@@ -197,3 +207,30 @@ def all_finite(tree: Any) -> bool:
     return all(
         bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(eqx.filter(tree, eqx.is_array))
     )
+
+
+def run_as_user(code: str, *arguments: Any, paths: tuple[Path, ...] = ()) -> Any:
+    """What a program prints after "RESULT", in a process of its own, as users' programs run.
+
+    There, programs are compiled with all optimisations: the tests' own shortcuts are off.
+    """
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("JAX_DISABLE_MOST_OPTIMIZATIONS", "XLA_FLAGS")
+    }
+    source = Path(xavatar_jax.__file__).parents[1]
+    found = [str(path) for path in (Path(__file__).parent, source, *paths)]
+    environment |= {"JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(found)}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.split("RESULT", 1)[1])
+
+
+@contextmanager
+def refused(message):
+    """A `ValueError` with this message; annotations refuse first where they are checked."""
+    with pytest.raises((ValueError, TypeCheckError)) as error:
+        yield
+    assert error.type is TypeCheckError or re.search(message, str(error.value))

@@ -1,4 +1,4 @@
-"""The texts against the project: links, names, commands, options, tables, figures, versions."""
+"""Checks of the documentation: links, names, commands, options, tables, figures, versions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import xavatar_jax as xa
-from xavatar_jax.body import PARTS, SMPLX_TREE, canonical_pose, pose_groups
+from xavatar_jax.body import SMPLX_TREE, STANDARD_PARTS, canonical_pose, pose_groups
 from xavatar_jax.cli import COMMANDS
 from xavatar_jax.cli.options import option_names
 from xavatar_jax.motion import FORMATS
@@ -33,7 +33,7 @@ PAGES = sorted(
 )
 SCRIPTS = sorted([*(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")])
 
-# Pages whose blocks of code build on those before them, and are run.
+# Pages whose code is run, each block after the previous ones.
 RUN_IN_ORDER = ("derivations.md", "extending.md")
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -44,7 +44,7 @@ def read(page: Path) -> str:
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    """Fenced blocks of a language."""
+    """Fenced code blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", read(page), re.DOTALL | re.MULTILINE)
 
 
@@ -53,13 +53,13 @@ def without_blocks(page: Path) -> str:
 
 
 def headings(page: Path) -> set[str]:
-    """Anchors that links may name, as GitHub makes them."""
+    """Anchors of the headings, as GitHub generates them."""
     titles = re.findall(r"^#+ (.+)$", without_blocks(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
 
 
 def table(page: str, heading: str) -> list[list[str]]:
-    """Rows of the first table after a heading, without head and rule, code marks removed."""
+    """Body rows of the first table after a heading, without code marks."""
     text = read(ROOT / "docs" / page).split(f"\n{heading}\n", 1)[1]
     lines = re.search(r"(?:^\|.*\n)+", text, re.MULTILINE)
     assert lines is not None
@@ -68,7 +68,7 @@ def table(page: str, heading: str) -> list[list[str]]:
 
 
 def numbers(text: str) -> set[int]:
-    """`0 to 2, 4` as a set."""
+    """Parse `0 to 2, 4` to a set."""
     found: set[int] = set()
     for part in filter(str.strip, text.split(",")):
         first, _, last = part.strip().partition(" to ")
@@ -77,13 +77,13 @@ def numbers(text: str) -> set[int]:
 
 
 def command_options(command: str) -> set[str]:
-    """Option names of a subcommand of `xavatar`."""
+    """Options of a subcommand of `xavatar`."""
     module = importlib.import_module(f"xavatar_jax.cli.{command}")
     return {"--help", "--debug", *option_names(module.Options).values()}
 
 
 def config_options() -> set[str]:
-    """Options of `xavatar fit` that are entries of the config."""
+    """Options of `xavatar fit` for entries of the config."""
 
     def entries(config, path):
         for entry in fields(config):
@@ -95,9 +95,9 @@ def config_options() -> set[str]:
 
 
 def script_options(script: Path) -> set[str]:
-    """Option names of a script: fields of its options dataclass, and arguments it adds.
+    """Options of a script: fields of its `Options` dataclass and `add_argument` calls.
 
-    A benchmark has those, too, of the modules beside it that it imports.
+    Benchmarks also have the options of benchmark modules they import.
     """
     if script.name == "fit_grab.py":
         return command_options("fit")
@@ -116,7 +116,7 @@ def script_options(script: Path) -> set[str]:
 
 
 @each_page
-def test_relative_links_lead_somewhere(page):
+def test_relative_links_have_targets(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", without_blocks(page)):
         if re.match(r"[a-z]+:", target):
             continue
@@ -146,7 +146,7 @@ def test_python_blocks_parse_and_import_what_they_use(page):
     imported: set[str] = set()
     for block in blocks(page, "python"):
         tree = ast.parse(block)
-        # Blocks of most pages stand for themselves.
+        # On other pages each block must be self-contained.
         imported = imported if page.name in RUN_IN_ORDER else set()
         imported |= {
             alias.asname or alias.name.split(".")[0]
@@ -204,13 +204,13 @@ def test_option_page_names_every_option_of_the_example():
     assert not [option for option in sorted(options) if option not in page]
 
 
-def test_readme_has_two_commands_that_set_themselves_up():
+def test_readme_has_two_self_contained_commands():
     commands = [b for b in blocks(ROOT / "README.md", "bash") if b.startswith("python3 -m venv")]
     assert [c.split(" && ")[-1].strip() for c in commands] == [
         ".venv/bin/python examples/fit_grab.py",
         ".venv/bin/python -m pytest",
     ]
-    # The check of the whole project finds the second one by this pattern.
+    # CI finds the second command by this pattern.
     assert "grep -E '^python3 .*-m pytest$' README.md" in read(ROOT / ".ci" / "run")
     assert re.search(r"^python3 .*-m pytest$", read(ROOT / "README.md"), re.MULTILINE)
 
@@ -239,8 +239,8 @@ def test_pose_table_is_the_parameter_names():
 def test_part_table_is_the_start_groups():
     rows = table("conventions.md", "## Parts")
     groups = xa.part_groups(SMPLX_TREE)
-    assert [r[1] for r in rows] == [*PARTS, "full"]
-    assert [r[0] for r in rows] == [*map(str, range(len(PARTS))), ""]
+    assert [r[1] for r in rows] == [*(part.name for part in STANDARD_PARTS), "full"]
+    assert [r[0] for r in rows] == [*map(str, range(len(STANDARD_PARTS))), ""]
     paper = xa.part_groups(SMPLX_TREE, "paper")
     for _, part, bones, more, joints, count in rows:
         assert numbers(bones) == set(paper[part].bones)
@@ -265,7 +265,7 @@ def test_motion_tables_are_the_formats():
     assert [row[0] for row in rows] == list(WRITERS)
 
 
-def test_packages_import_only_what_stands_above_them():
+def test_packages_import_only_those_above_them():
     order = [row[0] for row in table("how-it-works.md", "## Where things are")]
     order = [name for cell in order for name in re.findall(r"\w+", cell)]
     source = ROOT / "src" / "xavatar_jax"
@@ -277,7 +277,7 @@ def test_packages_import_only_what_stands_above_them():
 
 
 def _imported_packages(file: Path, source: Path) -> set[str]:
-    """Packages of this project that a file imports, at its top or inside functions."""
+    """Packages of this project that a file imports, also inside functions."""
     inside = ("xavatar_jax", *file.relative_to(source).parent.parts)
     found: set[str] = set()
     for node in ast.walk(ast.parse(read(file))):
@@ -294,7 +294,7 @@ def _imported_packages(file: Path, source: Path) -> set[str]:
     return found
 
 
-def test_tables_of_figures_are_those_of_the_files():
+def test_generated_tables_match_the_stored_results():
     spec = importlib.util.spec_from_file_location(
         "figures_update", ROOT / "docs" / "figures" / "update.py"
     )
@@ -309,7 +309,7 @@ def test_tables_of_figures_are_those_of_the_files():
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "docs" / "figures").glob("*.json")), ids=str)
-def test_kept_figures_name_no_path(file):
+def test_stored_results_contain_no_paths(file):
     def strings(value):
         if isinstance(value, dict):
             value = value.values()
@@ -323,7 +323,7 @@ def test_kept_figures_name_no_path(file):
 
 
 @pytest.mark.parametrize("name", RUN_IN_ORDER)
-def test_code_of_pages_that_build_on_themselves_runs(name, tmp_path, monkeypatch):
+def test_code_of_pages_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for k, block in enumerate(blocks(ROOT / "docs" / name, "python")):
@@ -362,14 +362,14 @@ def test_notebooks_are_listed_and_run():
 
 
 def public_names() -> dict[str, set[str]]:
-    """What the package and each subpackage import `as` themselves."""
+    """Names that the package and its subpackages, at any depth, import `as` themselves."""
     source = ROOT / "src" / "xavatar_jax"
     found = {}
-    for file in [source / "__init__.py", *sorted(source.glob("*/__init__.py"))]:
+    for file in sorted(source.rglob("__init__.py")):
         dotted = ".".join(file.parent.relative_to(source.parent).parts)
         aliases = [
             alias.name
-            for node in ast.walk(ast.parse(read(file)))  # the package's own stand in a branch
+            for node in ast.walk(ast.parse(read(file)))  # some are inside `if TYPE_CHECKING`
             if isinstance(node, ast.ImportFrom)
             for alias in node.names
             if alias.asname == alias.name and not alias.name.startswith("_")
@@ -382,10 +382,10 @@ PUBLIC = public_names()
 
 
 def constant_docstrings(package: str) -> set[str]:
-    """Names of a package's modules that a string stands below: how a constant is documented."""
+    """Constants of a package's modules that are documented by a string below them."""
     folder = Path(str(sys.modules[package].__file__)).parent
     found = set()
-    for file in folder.glob("*.py"):
+    for file in folder.rglob("*.py"):
         body = ast.parse(read(file)).body
         for node, after in pairwise(body):
             target = node.targets[0] if isinstance(node, ast.Assign) else None
@@ -404,22 +404,31 @@ def test_every_public_name_has_a_docstring(package):
     missing = []
     for name in sorted(PUBLIC[package]):
         value = getattr(module, name)
+        if name in constants:
+            continue
         if inspect.isfunction(value):
             missing += [] if value.__doc__ else [name]
         elif inspect.isclass(value):
-            # A dataclass without a text of its own gets its signature for one.
+            # A dataclass without a docstring gets its signature as one.
             own = value.__doc__ and not value.__doc__.startswith(f"{name}(")
             missing += [] if own else [name]
             missing += [f"{name}.{member}" for member in _undocumented_members(value)]
         elif not (hasattr(value, "__wrapped__") and value.__doc__):
-            missing += [] if name in constants else [name]
+            missing.append(name)
     assert not missing
 
 
 def _undocumented_members(kind: type) -> list[str]:
-    """Public methods and properties that neither the class nor what it inherits describes."""
+    """Public methods and properties without a docstring, inherited ones included."""
     found = []
+    # The docstring of a protocol may describe its members.
+    described = set()
+    if getattr(kind, "_is_protocol", False):
+        described = set(re.findall(r"`(\w+)`", kind.__doc__ or ""))
+    defaults = {field.name for field in fields(kind)} if is_dataclass(kind) else set()
     for name, member in vars(kind).items():
+        if name in defaults | described:  # the default of a field may be a function
+            continue
         function = getattr(member, "fget", None) or getattr(member, "func", None) or member
         function = getattr(function, "__func__", function)
         written_here = inspect.isfunction(function) and function.__module__ == kind.__module__
@@ -428,7 +437,7 @@ def _undocumented_members(kind: type) -> list[str]:
     return found
 
 
-def test_the_front_has_only_names_that_the_reference_has():
+def test_top_level_names_are_in_the_reference():
     elsewhere = set().union(*(names for p, names in PUBLIC.items() if p != "xavatar_jax"))
     assert PUBLIC["xavatar_jax"] <= elsewhere
 
@@ -440,7 +449,7 @@ def test_the_site_lists_every_page():
     assert listed == pages | made | {"api/index.md"}
 
 
-def test_runner_of_commands_knows_no_command_that_is_gone():
+def test_command_runner_has_no_stale_commands():
     spec = importlib.util.spec_from_file_location("commands", ROOT / ".ci" / "run_commands.py")
     assert spec is not None
     assert spec.loader is not None
@@ -449,7 +458,7 @@ def test_runner_of_commands_knows_no_command_that_is_gone():
     assert not sorted(set(runner.HOW) - set(runner.commands()))
 
 
-def test_version_stands_the_same_everywhere():
+def test_versions_agree():
     cited = re.search(r"^version: (\S+)$", read(ROOT / "CITATION.cff"), re.MULTILINE)
     assert cited is not None
     assert cited[1] == xa.__version__

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from xavatar_jax.body import SMPLX_TREE
-from xavatar_jax.body.synthetic.skeleton import rest_joints
+from xavatar_jax.synthetic.body.skeleton import rest_joints
 
 HAND_MEAN_DEG = 9.0
 

@@ -1,6 +1,6 @@
-"""Keeps the measured figures and puts them into the texts, so that no figure is typed by hand.
+"""Store measured results and generate the tables of README and docs from them.
 
-    python docs/figures/update.py                                    # write the tables again
+    python docs/figures/update.py                                    # regenerate the tables
     python docs/figures/update.py --metrics out/fit_grab/metrics.json
     python docs/figures/update.py --part-aware part_aware.json
     python docs/figures/update.py --animate animate.json --view view.json
@@ -8,9 +8,9 @@
     python docs/figures/update.py --borders borders.json
     python docs/figures/update.py --table1 table1.json --table2 table2.json --curve curve.json
 
-A result is copied into this folder without what is of no use elsewhere (paths, single frames).
-A text has its tables between `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`; the table
-of presets comes from the library itself.
+Results are copied into this folder without paths and per-frame values. A generated table is
+enclosed by `<!-- figures: FILE VIEW -->` and `<!-- end of figures -->`. The table of presets is
+read from the library.
 """
 
 from __future__ import annotations
@@ -65,13 +65,13 @@ _ENTRIES = (
     ("steps", "{}"),
     ("train_frames", "{} (0: all)"),
     ("frames_per_step", "{}"),
-    ("points_per_step", "{}, of each frame"),
-    ("points.total", "{}, drawn of each frame"),
+    ("points_per_step", "{}, per frame"),
+    ("points.total", "{}, drawn per frame"),
     ("skinning.kind", "{}"),
     ("geometry.kind", "{}"),
     ("search.starts", "{}"),
     ("search.cached", "{}"),
-    ("search.keep", "{}, roots a point"),
+    ("search.keep", "{}, roots per point"),
     ("losses.softness", "{}, metres"),
     ("losses.bone", "{}"),
     ("losses.joint", "{}"),
@@ -85,16 +85,16 @@ _ENTRIES = (
     ("validation.every", "{}, steps"),
     ("validation.patience", "{}, steps"),
     ("prefit_steps", "{}"),
-    ("settle_steps", "{}"),
+    ("weights_steps", "{}"),
 )
 _SEARCH = (
     ("search_points_per_s", "search, points/s", 0),
-    ("starts_per_point", "starts a point", 1),
-    ("steps_per_start", "solver steps a start", 1),
-    ("recall_all", "known correspondences found, all", 4),
-    ("recall_body", "the same, body", 4),
-    ("recall_face", "the same, face", 4),
-    ("recall_hands", "the same, hands", 4),
+    ("starts_per_point", "starts per point", 1),
+    ("steps_per_start", "solver steps per start", 1),
+    ("recall_all", "recall of known correspondences, all", 4),
+    ("recall_body", "recall, body", 4),
+    ("recall_face", "recall, face", 4),
+    ("recall_hands", "recall, hands", 4),
     ("train_steps_per_s", "training, steps/s", 3),
     ("cd_all_mm", "equal steps: Chamfer, all, mm", 2),
     ("cd_hands_mm", "equal steps: Chamfer, hands, mm", 2),
@@ -105,43 +105,43 @@ _SEARCH = (
 )
 _ANIMATE = (
     ("frames_per_s", "frames/s", 1),
-    ("processor_ms_per_frame", "processor time a frame, ms", 1),
-    ("vertex_mean_mm", "from vertex to vertex, mean, mm", 3),
-    ("vertex_p99_mm", "the same, 99th percentile", 2),
-    ("surface_mean_mm", "from vertex to surface, mean, mm", 3),
-    ("surface_p99_mm", "the same, 99th percentile", 2),
-    ("surface_max_mm", "the same, maximum", 1),
+    ("processor_ms_per_frame", "CPU time per frame, ms", 1),
+    ("vertex_mean_mm", "vertex-to-vertex error, mean, mm", 3),
+    ("vertex_p99_mm", "vertex-to-vertex error, 99th percentile, mm", 2),
+    ("surface_mean_mm", "vertex-to-surface error, mean, mm", 3),
+    ("surface_p99_mm", "vertex-to-surface error, 99th percentile, mm", 2),
+    ("surface_max_mm", "vertex-to-surface error, maximum, mm", 1),
 )
 _EXPORT = (
     ("seconds", "time, s", 1),
     ("megabytes", "size, MB", 1),
-    ("influences_mean_mm", "lost by bones left out, mean, mm", 3),
-    ("influences_max_mm", "the same, maximum", 2),
-    ("rig_mean_mm", "lost in all, mean, mm", 3),
-    ("rig_max_mm", "the same, maximum", 1),
+    ("influences_mean_mm", "error from dropped bones, mean, mm", 3),
+    ("influences_max_mm", "error from dropped bones, maximum, mm", 2),
+    ("rig_mean_mm", "total error, mean, mm", 3),
+    ("rig_max_mm", "total error, maximum, mm", 1),
 )
 _EXTRACTION_COLUMNS = (
     ("vertices", "vertices", 0),
     ("seconds", "s", 1),
-    ("first_s", "the first time, s", 1),
-    ("rss_rise_mb", "rise of memory, MiB", 0),
+    ("first_s", "first call, s", 1),
+    ("rss_rise_mb", "memory increase, MiB", 0),
 )
-_SECONDS_COLUMNS = (("seconds", "s", 2), ("processor_s", "of processor time, s", 2))
+_SECONDS_COLUMNS = (("seconds", "s", 2), ("processor_s", "CPU time, s", 2))
 
 
 def slim_metrics(record: dict[str, Any]) -> dict[str, Any]:
-    """What is kept of a run's `metrics.json`."""
+    """The stored part of a run's `metrics.json`."""
     return {name: record[name] for name in _KEPT if name in record}
 
 
 def slim_benchmark(record: dict[str, Any]) -> dict[str, Any]:
-    """What is kept of a benchmark's JSON."""
+    """The stored part of a benchmark's JSON."""
     header = {name: value for name, value in record["header"].items() if name != "platform"}
     return {"header": header, "rows": record["rows"]}
 
 
 def accuracy_view(record: dict[str, Any]) -> str:
-    """Held-out figures after and before training, and what they were measured on."""
+    """Held-out metrics before and after training, with the setup of the run."""
     before = record["before"]
     head = [f"{record['frames']} held-out frames"]
     for region in REGIONS:
@@ -157,15 +157,15 @@ def accuracy_view(record: dict[str, Any]) -> str:
     return (
         f"{_table(rows)}\n\n"
         f"Preset `{record['preset']}`, {record['steps']} steps, seed {record['seed']}, "
-        f"{_machine(record)}: {record['seconds']['total']:.0f} s in all, "
-        f"{record['peak_rss_mb'] / 1024:.1f} GiB of memory at most. "
-        f"*Before* is the start, the body's mean shape on the person's skeleton, "
+        f"{_machine(record)}: {record['seconds']['total']:.0f} s in total, "
+        f"{record['peak_rss_mb'] / 1024:.1f} GiB peak memory. "
+        f"*Before*: the body's mean shape on the person's skeleton, before training, "
         f"on {few} of the frames."
     )
 
 
 def seeds_view(record: dict[str, Any]) -> str:
-    """Medians over runs with other seeds, and from where to where their figures go."""
+    """Median, minimum and maximum over seeds."""
     runs = record["runs"]
     rows = [[f"{len(runs)} seeds", *REGIONS]]
     for name, label, digits in _FIGURES:
@@ -181,31 +181,31 @@ def seeds_view(record: dict[str, Any]) -> str:
     seconds = sorted(run["seconds"]["total"] for run in runs)
     return (
         f"{_table(rows)}\n\n{_sentence(_machine(runs[0]))}; seeds {seeds}, {seconds[0]:.0f} to "
-        f"{seconds[-1]:.0f} s in all."
+        f"{seconds[-1]:.0f} s in total."
     )
 
 
 def paper_view(record: dict[str, Any]) -> str:
-    """The same for some steps of `paper`, and how long all of them would take."""
+    """Metrics after a few steps of `paper`, with an estimate of the time of the full schedule."""
     import xavatar_jax as xa
 
     steps = xa.paper().steps
     seconds = record["stages"]["train"] / record["steps"]
     return (
-        f"{accuracy_view(record)} A step takes {seconds:.0f} s: the {steps:,} of the whole "
-        f"schedule would take {steps * seconds / 3600:.0f} hours."
+        f"{accuracy_view(record)} A step takes {seconds:.0f} s, so the full schedule of {steps:,} "
+        f"steps would take {steps * seconds / 3600:.0f} hours."
     )
 
 
 def stages_view(record: dict[str, Any]) -> str:
-    """Seconds by stage."""
+    """Seconds per stage."""
     rows = [["stage", "seconds"]]
     rows += [[name, f"{value:.0f}"] for name, value in record["seconds"].items()]
     return f"{_table(rows)}\n\n{_sentence(_machine(record))}."
 
 
 def distance_view(record: dict[str, Any]) -> str:
-    """Held-out figures by how far a pose is from those learned from."""
+    """Held-out metrics grouped by distance to the nearest training pose."""
     if "by_pose_distance" not in record:
         return NOT_MEASURED
     rows = [["", "degrees", "frames", *(f"Chamfer, {region}, mm" for region in REGIONS)]]
@@ -217,7 +217,7 @@ def distance_view(record: dict[str, Any]) -> str:
 
 
 def benchmark_view(record: dict[str, Any]) -> str:
-    """One column a start set."""
+    """One column per start set."""
     columns = record["rows"]
     rows = [["", *(column["starts"] for column in columns)]]
     for name, label, digits in _SEARCH:
@@ -226,13 +226,13 @@ def benchmark_view(record: dict[str, Any]) -> str:
     size = "quick" if header["quick"] else "full"
     return (
         f"{_table(rows)}\n\n{_sentence(_machine(header))}; {size} run, seed {header['seed']}, "
-        f"{header['points_per_step']} points a training step; equal time is "
+        f"{header['points_per_step']} points per training step; equal time: "
         f"{header['equal_time_s']:.0f} s of training."
     )
 
 
 def animate_view(record: dict[str, Any]) -> str:
-    """One column a way of following pose and expression."""
+    """One column per value of `offsets`."""
     columns, header = record["rows"], record["header"]
     rows = [["`offsets`", *(f"`{column['offsets']}`" for column in columns)]]
     for name, label, digits in _ANIMATE:
@@ -240,23 +240,23 @@ def animate_view(record: dict[str, Any]) -> str:
         rows.append([label, *(value if value != "not measured" else "-" for value in values)])
     return (
         f"{_table(rows)}\n\n{_sentence(_machine(header))}; preset `{header['preset']}`, "
-        f"{header['vertices']} vertices, {header['frames']} frames; extraction of the neutral "
-        f"surface {header['extraction_s']:.1f} s and what is kept of it {header['base_s']:.1f} s, "
-        f"once an avatar."
+        f"{header['vertices']} vertices, {header['frames']} frames. Once per avatar: "
+        f"{header['extraction_s']:.1f} s to extract the neutral surface and "
+        f"{header['base_s']:.1f} s to cache its features."
     )
 
 
 def export_view(record: dict[str, Any]) -> str:
-    """One column a number of influences."""
+    """One column per number of influences."""
     exports, header = record["header"]["exports"], record["header"]
-    rows = [["influences a vertex", *(str(export["influences"]) for export in exports)]]
+    rows = [["influences per vertex", *(str(export["influences"]) for export in exports)]]
     for name, label, digits in _EXPORT:
         rows.append([label, *(_number(export[name], digits) for export in exports)])
     return f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['frames']} frames."
 
 
 def extraction_view(record: dict[str, Any]) -> str:
-    """The canonical surface at cells of some sizes."""
+    """Extraction of the canonical surface at several cell sizes."""
     header = record["header"]
     rows = [["cells", *(label for _, label, _ in _EXTRACTION_COLUMNS)]]
     rows += [[row["cells"], *_cells(row, _EXTRACTION_COLUMNS)] for row in header["extractions"]]
@@ -264,7 +264,7 @@ def extraction_view(record: dict[str, Any]) -> str:
 
 
 def seconds_view(record: dict[str, Any]) -> str:
-    """What takes how long."""
+    """Seconds per task."""
     rows = [["", *(label for _, label, _ in _SECONDS_COLUMNS)]]
     rows += [[row["what"], *_cells(row, _SECONDS_COLUMNS)] for row in record["rows"]]
     header = record["header"]
@@ -272,32 +272,32 @@ def seconds_view(record: dict[str, Any]) -> str:
 
 
 _PATHS = {
-    ("plain", "mlp"): "network, plain path",
+    ("plain", "mlp"): "network, reference path",
     ("batched", "mlp"): "network, batched",
     ("guided", "mlp"): "network, guided by the grid",
-    ("plain", "grid"): "grid, plain path",
+    ("plain", "grid"): "grid, reference path",
     ("grid", "grid"): "grid",
 }
 _PATH_COLUMNS = (
     ("points_per_s", "points/s", 0),
     ("points_per_s_with_tables", "with tables", 0),
-    ("times_plain", "times plain", 1),
-    ("recall_all", "found, all", 4),
+    ("times_plain", "speed-up", 1),
+    ("recall_all", "recall, all", 4),
     ("recall_body", "body", 4),
     ("recall_face", "face", 4),
     ("recall_hands", "hands", 4),
-    ("recall_plain_points", "the plain path's points", 4),
+    ("recall_plain_points", "recall, reference points", 4),
     ("residual_max_um", "largest residual, µm", 1),
-    ("steps_per_start", "steps a start", 1),
-    ("starts_per_point", "starts a point", 1),
+    ("steps_per_start", "steps per start", 1),
+    ("starts_per_point", "starts per point", 1),
     ("compile_s", "compile, s", 1),
 )
 _BATCH_COLUMNS = (
-    ("points", "points at once", 0),
+    ("points", "points per call", 0),
     ("points_per_s", "points/s", 0),
-    ("cost_ratio", "cost a point, against the least", 2),
+    ("cost_ratio", "cost per point, relative", 2),
     ("temporary_mb", "temporary memory, MiB", 0),
-    ("rss_rise_mb", "rise of resident memory, MiB", 0),
+    ("rss_rise_mb", "increase of resident memory, MiB", 0),
 )
 _RESOLUTION_COLUMNS = (
     ("nodes", "nodes", 0),
@@ -308,29 +308,29 @@ _RESOLUTION_COLUMNS = (
     ("posed_error_median_mm", "posed error, median, mm", 2),
     ("posed_error_p99_mm", "99 %", 1),
     ("grid_points_per_s", "grid, points/s", 0),
-    ("grid_recall_all", "grid, found", 4),
+    ("grid_recall_all", "grid, recall", 4),
     ("guided_points_per_s", "guided, points/s", 0),
-    ("guided_recall_all", "guided, found", 4),
+    ("guided_recall_all", "guided, recall", 4),
     ("guided_recall_hands", "hands", 4),
 )
 _CONTACT_COLUMNS = (
     ("points", "points", 0),
-    ("roots_per_point", "roots a point", 2),
-    ("share_of_points_with_every_root", "points with every root", 4),
+    ("roots_per_point", "roots per point", 2),
+    ("share_of_points_with_every_root", "points with all roots", 4),
     ("share_of_roots", "roots found", 4),
-    ("inverted_roots_per_point", "inverted roots a point", 2),
-    ("share_of_points_with_inverted_roots_too", "points with those too", 4),
+    ("inverted_roots_per_point", "inverted roots per point", 2),
+    ("share_of_points_with_inverted_roots_too", "points with all roots, inverted ones included", 4),
 )
 _BORDER_COLUMNS = (
     ("pose_deg", "degrees", 0),
     ("points", "points", 0),
-    ("recall", "found", 4),
-    ("starts_per_point", "starts a point", 1),
+    ("recall", "recall", 4),
+    ("starts_per_point", "starts per point", 1),
 )
 
 
 def paths_view(degrees: float) -> Callable[[dict[str, Any]], str]:
-    """Paths x fields x start sets at one difficulty."""
+    """Paths, fields and start sets at one pose range."""
 
     def view(record: dict[str, Any]) -> str:
         rows = [["path", "starts", *(label for _, label, _ in _PATH_COLUMNS)]]
@@ -345,7 +345,7 @@ def paths_view(degrees: float) -> Callable[[dict[str, Any]], str]:
 
 
 def batches_view(record: dict[str, Any]) -> str:
-    """Cost a point and memory against batch size."""
+    """Cost per point and memory by batch size."""
     rows = [["path", *(label for _, label, _ in _BATCH_COLUMNS)]]
     found = _of_table(record, "batches")
     best: dict[str, float] = {}
@@ -358,7 +358,7 @@ def batches_view(record: dict[str, Any]) -> str:
 
 
 def resolution_view(record: dict[str, Any]) -> str:
-    """Grids of several spacings, beside the network that they tabulate."""
+    """Grids of several spacings compared with the network they tabulate."""
     rows = [["body, hands, face, mm", *(label for _, label, _ in _RESOLUTION_COLUMNS)]]
     for row in _of_table(record, "resolution"):
         spacing = ", ".join(f"{row[f'{name}_mm']:g}" for name in ("body", "hands", "face"))
@@ -367,7 +367,7 @@ def resolution_view(record: dict[str, Any]) -> str:
 
 
 def contact_view(record: dict[str, Any]) -> str:
-    """Whether every canonical point is found where a body touches itself."""
+    """Recall of all roots where a body touches itself."""
     rows = [["case", "path", "starts", *(label for _, label, _ in _CONTACT_COLUMNS)]]
     for row in _of_table(record, "contact"):
         name = _PATHS[row["path"], row["field"]]
@@ -376,30 +376,30 @@ def contact_view(record: dict[str, Any]) -> str:
 
 
 def borders_view(record: dict[str, Any]) -> str:
-    """Recall at borders of parts, by what is known of a point."""
-    rows = [["border", "starts of", *(label for _, label, _ in _BORDER_COLUMNS)]]
+    """Recall at the borders of parts, by choice of start set."""
+    rows = [["border", "start set", *(label for _, label, _ in _BORDER_COLUMNS)]]
     for row in record["rows"]:
         rows.append([row["border"], row["starts"], *_cells(row, _BORDER_COLUMNS)])
     return _with_run(rows, record)
 
 
 def accuracy_of_gradients_view(record: dict[str, Any]) -> str:
-    """Errors beside finite differences."""
-    rows = [["method", "by", "mode", "largest error", "median", "below 1e-5"]]
+    """Errors relative to finite differences."""
+    rows = [["method", "w.r.t.", "mode", "largest error", "median", "below 1e-5"]]
     for row in _of_table(record, "accuracy"):
         errors = (f"{row[name]:.1e}" for name in ("relative_error_max", "relative_error_median"))
         share = f"{row['share_below_1e-5']:.4f}"
         rows.append([row["method"], row["by"], row["mode"], *errors, share])
     header = record["header"]
     return (
-        f"{_with_run(rows, record)[:-1]}, {header['regular_points']} of {header['points']} points "
-        f"with a determinant of {header['min_determinant']} or more."
+        f"{_with_run(rows, record)[:-1]}; {header['regular_points']} of {header['points']} points "
+        f"have a determinant of at least {header['min_determinant']}."
     )
 
 
 def float32_view(record: dict[str, Any]) -> str:
-    """Derivatives in float32 beside those in float64."""
-    rows = [["roots", "by", "mode", "largest gap", "99 %", "median", "below 1e-3"]]
+    """Derivatives in float32 compared with float64."""
+    rows = [["roots", "w.r.t.", "mode", "largest gap", "99 %", "median", "below 1e-3"]]
     for row in _of_table(record, "float32"):
         names = ("relative_gap_max", "relative_gap_p99", "relative_gap_median")
         gaps = (f"{row[name]:.1e}" for name in names)
@@ -408,8 +408,8 @@ def float32_view(record: dict[str, Any]) -> str:
 
 
 def floor_view(record: dict[str, Any]) -> str:
-    """The truth against itself."""
-    rows = [["samples on either mesh", *(f"bounding-box IoU, {region}" for region in REGIONS)]]
+    """Metrics of the ground truth against itself."""
+    rows = [["samples per mesh", *(f"bounding-box IoU, {region}" for region in REGIONS)]]
     for row in record["rows"]:
         rows.append(
             [str(row["samples"]), *(f"{row[f'iou_box_{region}']:.3f}" for region in REGIONS)]
@@ -419,9 +419,9 @@ def floor_view(record: dict[str, Any]) -> str:
 
 
 def memory_view(record: dict[str, Any]) -> str:
-    """Peaks of whole processes, in GiB, a row for each count of frames."""
-    stages = (("fit", "after learning"), ("all", "after an evaluation"))
-    rows = [["frames to learn from", "chosen", *(f"{label}, GiB" for _, label in stages)]]
+    """Peak memory of the process, one row per number of frames."""
+    stages = (("fit", "after training"), ("all", "after evaluation"))
+    rows = [["training frames", "chosen", *(f"{label}, GiB" for _, label in stages)]]
     for row in record["rows"]:
         peaks = [f"{row[f'peak_rss_{name}_mb'] / 1024:.2f}" for name, _ in stages]
         rows.append([f"{row['frames']:,}", str(row["learned_from"]), *peaks])
@@ -437,8 +437,8 @@ _RUN_COLUMNS = (
 _ABLATION_COLUMNS = (
     *_RUN_COLUMNS,
     ("steps", "steps", 0),
-    ("step_ms", "a step, ms", 0),
-    ("search_share", "search's share", 2),
+    ("step_ms", "ms per step", 0),
+    ("search_share", "share of the search", 2),
     ("seeds", "seeds", 0),
 )
 _METHOD_COLUMNS = (
@@ -448,7 +448,7 @@ _METHOD_COLUMNS = (
     ("nc_all", "normal consistency", 3),
     ("iou_all", "IoU", 3),
     ("steps", "steps", 0),
-    ("mesh_ms", "a mesh, ms", 0),
+    ("mesh_ms", "ms per mesh", 0),
     ("seeds", "seeds", 0),
 )
 _CURVE_COLUMNS = (
@@ -462,7 +462,7 @@ _CURVE_COLUMNS = (
 def medians_view(
     by: tuple[str, ...], columns: tuple[tuple[str, str, int], ...]
 ) -> Callable[[dict[str, Any]], str]:
-    """Medians over seeds, a row for each different `by`; what is a column too is no row's name."""
+    """Medians over seeds, one row per distinct `by`; entries that are columns are not repeated."""
     shown = [name for name in by if name not in {column for column, _, _ in columns}]
 
     def view(record: dict[str, Any]) -> str:
@@ -474,9 +474,9 @@ def medians_view(
         for row in sorted(found, key=lambda row: (first.index(row[by[0]]), row.get("minutes", 0))):
             rows.append([*(f"{row[name]}" for name in shown), *_cells(row, columns)])
         header = record["header"]
-        budget = f", {header['minutes']:g} minutes a run" if "minutes" in header else ""
+        budget = f", {header['minutes']:g} minutes per run" if "minutes" in header else ""
         commits = list(dict.fromkeys(row["commit"][:7] for row in record["rows"]))
-        made = f" Runs of commits {', '.join(commits)}." if len(commits) > 1 else ""
+        made = f" Commits: {', '.join(commits)}." if len(commits) > 1 else ""
         return (
             f"{_table(rows)}\n\n{_sentence(_machine(header))}; {header['eval_frames']} held-out "
             f"frames{budget}; medians over seeds.{made}"
@@ -486,8 +486,8 @@ def medians_view(
 
 
 def time_of_gradients_view(record: dict[str, Any]) -> str:
-    """Roots and their derivatives by the field's parameters, milliseconds."""
-    rows = [["method", "mode", "ms for 1000 points", "first call, s"]]
+    """Milliseconds for roots and their derivatives with respect to the field's parameters."""
+    rows = [["method", "mode", "ms per 1000 points", "first call, s"]]
     for row in _of_table(record, "time"):
         rows.append(
             [
@@ -499,8 +499,8 @@ def time_of_gradients_view(record: dict[str, Any]) -> str:
         )
     (step,) = _of_table(record, "step")
     return (
-        f"{_with_run(rows, record)} A step of training with the search inside compiles in "
-        f"{step['compile_s']:.1f} s and is traced {step['traces']} time in two calls."
+        f"{_with_run(rows, record)} A training step with the search inside compiles in "
+        f"{step['compile_s']:.1f} s; traces in two calls: {step['traces']}."
     )
 
 
@@ -509,7 +509,7 @@ def _of_table(record: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _cells(row: dict[str, Any], columns: tuple[tuple[str, str, int], ...]) -> list[str]:
-    # A dash: this path has no such figure.
+    # A dash: not defined for this path.
     found = [(row.get(name), digits) for name, _, digits in columns]
     return ["–" if value is None else f"{value:.{digits}f}" for value, digits in found]
 
@@ -523,7 +523,7 @@ def _with_run(rows: list[list[str]], record: dict[str, Any]) -> str:
     if "grid_mm" in header:
         spacing = {name: header.get(f"{name}_mm") for name in ("grid", "guide")}
         sizes = [
-            f"{name} of {', '.join(f'{value:g}' for value in mm)} mm"
+            f"{name} spacing {', '.join(f'{value:g}' for value in mm)} mm"
             for name, mm in spacing.items()
             if mm
         ]
@@ -535,7 +535,7 @@ def _with_run(rows: list[list[str]], record: dict[str, Any]) -> str:
 
 
 def presets_view() -> str:
-    """Entries of the two presets, side by side."""
+    """The two presets side by side."""
     import xavatar_jax as xa
 
     rows = [["entry", "`quick`", "`paper`"]]
@@ -576,9 +576,9 @@ _BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", 
 
 
 def filled(text: str) -> str:
-    """The text with every table written anew.
+    """The text with all tables regenerated.
 
-    **Raises:** `KeyError` for a block that no view knows.
+    **Raises:** `KeyError` for a block without a view.
     """
 
     def write(match: re.Match[str]) -> str:
@@ -640,13 +640,13 @@ _STORED = {
     "table2": TABLE2,
     "curve": CURVE,
 }
-"""Where the file of each option is kept."""
+"""File in this folder for each option."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--metrics", help="metrics.json of examples/fit_grab.py")
-    parser.add_argument("--metrics-paper", help="the same with --preset paper --steps 20")
+    parser.add_argument("--metrics-paper", help="metrics.json of a --preset paper --steps 20 run")
     parser.add_argument("--part-aware", help="JSON of benchmarks/part_aware_vs_all_bones.py")
     parser.add_argument("--animate", help="JSON of benchmarks/animate.py")
     parser.add_argument("--surface", help="JSON of benchmarks/animate.py --surface, preset paper")
@@ -659,7 +659,7 @@ def main() -> None:
     parser.add_argument("--table1", help="JSON of benchmarks/table1_ablations.py")
     parser.add_argument("--table2", help="JSON of benchmarks/table2_grab.py")
     parser.add_argument("--curve", help="JSON of benchmarks/accuracy_over_time.py")
-    parser.add_argument("--metrics-seeds", nargs="+", help="several metrics.json, one a seed")
+    parser.add_argument("--metrics-seeds", nargs="+", help="several metrics.json, one per seed")
     args = parser.parse_args()
     for option, source in vars(args).items():
         if option == "metrics_seeds" and source:

@@ -1,4 +1,4 @@
-"""Draws the conventions for the docs: axes, joints, parts, canonical pose, mean hand, weights.
+"""Draw the figures of conventions: axes, joints, parts, poses, hands, skinning weights.
 
 python docs/pictures/conventions.py
 """
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import xavatar_jax as xa
-from xavatar_jax.body import FACES, LEFT_HAND, rest_joints
+from xavatar_jax.body import rest_joints
 from xavatar_jax.render import (
     Camera,
     draw_text,
@@ -34,14 +34,14 @@ PART_COLORS = np.array(
 
 
 def body_mesh(body: xa.BodyModel, params: xa.BodyParams, colors: np.ndarray | None) -> xa.Mesh:
-    """The body in its own colours, or in others."""
+    """The posed body, in its own colours by default."""
     vertices = np.asarray(xa.pose_body(body, params).vertices, np.float32)
     mesh = xa.Mesh(vertices, np.asarray(body.faces)).compute_normals()
     return replace(mesh, colors=np.asarray(body.colors) if colors is None else colors)
 
 
 def rod(start: np.ndarray, end: np.ndarray, radius: float, color: tuple, *, tip: bool) -> xa.Mesh:
-    """A rod between two points, with an arrow's tip at its end if asked for."""
+    """A rod between two points, with an arrow tip if `tip`."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
     across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
@@ -49,12 +49,12 @@ def rod(start: np.ndarray, end: np.ndarray, radius: float, color: tuple, *, tip:
     sides, head = 24, 3.5 * radius if tip else 0.0
     angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     ring = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.cross(along, across)
-    # Light is measured at vertices, and those at the ends may lie inside of something else.
+    # Light is computed at vertices, and the end vertices may lie inside another mesh.
     stations = np.linspace(0, length - head, 24)
     profile = [(1e-6, 0.0), *((radius, float(h)) for h in stations)]
     profile += [(2 * radius, length - head)] if tip else []
     profile += [(1e-6, length)]
-    # Every stretch has vertices of its own, so that edges stay sharp.
+    # Segments do not share vertices, so that edges stay sharp.
     pieces = []
     for (r0, h0), (r1, h1) in pairwise(profile):
         vertices = np.concatenate([start + h * along + r * ring for r, h in ((r0, h0), (r1, h1))])
@@ -66,7 +66,7 @@ def rod(start: np.ndarray, end: np.ndarray, radius: float, color: tuple, *, tip:
 
 
 def ball(centre: np.ndarray, radius: float, color: tuple) -> xa.Mesh:
-    """A ball."""
+    """A sphere."""
     import trimesh
 
     shape = trimesh.creation.icosphere(subdivisions=2, radius=radius)
@@ -80,7 +80,7 @@ def plain(vertices: np.ndarray, faces: np.ndarray, color: tuple) -> xa.Mesh:
 
 
 def joined(meshes: Iterable[xa.Mesh]) -> xa.Mesh:
-    """Several meshes as one."""
+    """Concatenate meshes."""
     meshes = list(meshes)
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     return xa.Mesh(
@@ -94,7 +94,7 @@ def joined(meshes: Iterable[xa.Mesh]) -> xa.Mesh:
 def labelled(
     picture: np.ndarray, camera: Camera, labels: dict[str, np.ndarray], size: int, shift=(12, -9)
 ) -> np.ndarray:
-    """The picture with words beside points of the world."""
+    """Draw labels next to points in world coordinates."""
     height, width = picture.shape[:2]
     for text, point in labels.items():
         u, v, _ = camera.project(np.asarray(point)[None], width, height)[0]
@@ -103,7 +103,7 @@ def labelled(
 
 
 def axes(body: xa.BodyModel) -> np.ndarray:
-    """The body at rest with the world's axes at its feet."""
+    """The body at rest with the world axes at its feet."""
     rest = body_mesh(body, xa.BodyParams.zeros(body), None)
     origin = np.array([0.0, rest.vertices[:, 1].min(), 0.0])
     lengths = {"x, the person's left": 0.75, "y, up": 2.05, "z, where the person looks": 0.75}
@@ -121,7 +121,7 @@ def axes(body: xa.BodyModel) -> np.ndarray:
 
 
 def skeleton(body: xa.BodyModel, joints: list[int], thick: float) -> xa.Mesh:
-    """Balls at joints and rods to their parents."""
+    """Spheres at joints and rods to their parents."""
     places = np.asarray(rest_joints(body, jnp.zeros(0)))
     parts = [ball(places[j], 1.7 * thick, RED) for j in joints]
     for j in joints:
@@ -132,7 +132,7 @@ def skeleton(body: xa.BodyModel, joints: list[int], thick: float) -> xa.Mesh:
 
 
 def joint_pictures(body: xa.BodyModel) -> np.ndarray:
-    """Numbers of the joints: the body from the front, the head from the left, the left hand."""
+    """Joint numbers: the body from the front, the head from the left, the left hand."""
     tree, places = body.tree, np.asarray(rest_joints(body, jnp.zeros(0)))
     trunk = list(range(22))
     head = tree.indices("spine3", "neck", "left_collar", "head", "jaw", "left_eye", "right_eye")
@@ -155,7 +155,7 @@ def parts(body: xa.BodyModel) -> np.ndarray:
     """Part labels in colour."""
     labels = np.asarray(body.part_labels)
     mesh = body_mesh(body, xa.BodyParams.zeros(body), PART_COLORS[labels])
-    hand, face = (mesh.vertices[np.isin(labels, p)] for p in ((LEFT_HAND,), FACES))
+    hand, face = (mesh.vertices[body.parts.mask(p)] for p in ("left_hand", "face"))
     cameras = (
         frame_view(mesh.vertices, "front"),
         part_view(face, (0.35, 0.05, 1.0), margin=1.35),
@@ -171,7 +171,7 @@ def poses(body: xa.BodyModel) -> np.ndarray:
     meshes = [body_mesh(body, p, None) for p in (flat, xa.canonical_params(body))]
     camera = frame_view(np.concatenate([m.vertices for m in meshes]), "front")
     row = [render_mesh(mesh, camera, 380) for mesh in meshes]
-    hand = np.isin(np.asarray(body.part_labels), LEFT_HAND)
+    hand = body.parts.mask("left_hand")
     for params in (flat, mean):
         mesh = body_mesh(body, params, None)
         camera = part_view(mesh.vertices[hand], (0.3, 0.8, 0.9), margin=1.2)
@@ -181,7 +181,7 @@ def poses(body: xa.BodyModel) -> np.ndarray:
 
 
 def weights(body: xa.BodyModel) -> np.ndarray:
-    """A posed body, and its skinning weights: a colour a bone, mixed."""
+    """A posed body and its skinning weights as a mixture of one colour per bone."""
     frames = xa.synthetic_capture(body=body).test.sequences["signs_and_piano"]
     params = frames[len(frames) // 3].params
     palette = np.random.default_rng(4).uniform(40, 255, (body.num_joints, 3))

@@ -1,8 +1,8 @@
-"""Draws the bundled person for the docs: at rest, posed, a hand, the face.
+"""Draw the bundled person for the docs: at rest, posed, a hand, the face.
 
     python docs/pictures/make.py
 
-`preview.png` and `animation.webp` beside them are those of `examples/fit_grab.py`.
+`preview.png` in the same folder is written by `examples/fit_grab.py`.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 
 import xavatar_jax as xa
-from xavatar_jax.body import FACES, LEFT_HAND
 from xavatar_jax.render import frame_view, part_view, render_mesh, save_png
 
 FOLDER = Path(__file__).resolve().parent
 
 
 def posed_mesh(body: xa.BodyModel, params: xa.BodyParams) -> xa.Mesh:
-    """The body in its own colours."""
+    """The posed body in its own colours."""
     vertices = np.asarray(xa.pose_body(body, params).vertices, np.float32)
     mesh = xa.Mesh(vertices, np.asarray(body.faces)).compute_normals()
     return mesh if body.colors is None else replace(mesh, colors=np.asarray(body.colors))
@@ -28,12 +27,11 @@ def posed_mesh(body: xa.BodyModel, params: xa.BodyParams) -> xa.Mesh:
 
 def main() -> None:
     body = xa.synthetic_body()
-    labels = np.asarray(body.part_labels)
     rest = posed_mesh(body, xa.BodyParams.zeros(body))
     frames = xa.synthetic_capture(body=body).test.sequences["signs_and_piano"]
     frame = frames[len(frames) // 2]
     posed = posed_mesh(body, frame.params)
-    hand, face = (rest.vertices[np.isin(labels, p)] for p in ((LEFT_HAND,), FACES))
+    hand, face = (rest.vertices[body.parts.mask(p)] for p in ("left_hand", "face"))
     pictures = {
         "body_rest": (rest, frame_view(rest.vertices, "front"), True),
         "body_posed": (posed, frame_view(posed.vertices, "three_quarter", aspect=0.75), True),

@@ -1,7 +1,7 @@
-"""What the site adds to the pages of this folder: the project's texts, the reference, formulas.
+"""MkDocs hooks: add README and other project files, generate the reference, render formulas.
 
-The Markdown files stay as they are read in the repository. Links that leave the folder are turned
-to where the site has the same text; formulas become MathML, so that a page loads no script.
+The Markdown files stay readable in the repository. Links to files outside docs/ are rewritten to
+the corresponding page of the site. Formulas become MathML, so pages load no scripts.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "xavatar_jax"
-# Texts above this folder, by the page that they are on the site.
+# Project files outside docs/, by their page on the site.
 TEXTS = {
     "readme.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
     "third-party-notices.md": "THIRD_PARTY_NOTICES.md",
 }
-# Files that pages link to, copied as they are.
+# Linked files that are copied unchanged.
 FILES = (
     "LICENSE",
     "CITATION.cff",
@@ -38,7 +38,7 @@ _CODE = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """List the reference's pages under its first one."""
+    """Add the reference pages to the navigation."""
     for item in config.nav or []:
         if "Reference" in item:
             pages = sorted(name for name in reference_pages() if name != "api/index.md")
@@ -47,38 +47,38 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the project's texts, the files beside them and the reference."""
+    """Add the project files, linked files and the reference."""
     for page, source in TEXTS.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, page, content=text))
     for name in FILES:
-        files.append(File.generated(config, _place(name), abs_src_path=str(ROOT / name)))
+        files.append(File.generated(config, _site_path(name), abs_src_path=str(ROOT / name)))
     for name, text in reference_pages().items():
         files.append(File.generated(config, name, content=text))
     return files
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
-    """Turn links that leave the folder to where the site has their text."""
+    """Rewrite links to files outside docs/ to their page on the site."""
     uri = page.file.src_uri
     where = Path(TEXTS[uri]).parent if uri in TEXTS else Path("docs") / Path(uri).parent
 
-    def turned(match: re.Match[str]) -> str:
+    def rewritten(match: re.Match[str]) -> str:
         head, target, anchor = match[1], match[2], match[3] or ""
         if re.match(r"[a-z]+:", target):
             return match[0]
         path = os.path.normpath(where / target).replace(os.sep, "/")
-        on_site = _place(path)
+        on_site = _site_path(path)
         here = os.path.dirname(uri) or "."
         return f"{head}{os.path.relpath(on_site, here).replace(os.sep, '/')}{anchor})"
 
-    # Code is left alone: what looks like a link there is an index or a call.
+    # Skip code, where indexing followed by a call looks like a link.
     parts = _CODE.split(markdown)
-    return "".join(p if k % 2 else _LINK.sub(turned, p) for k, p in enumerate(parts))
+    return "".join(p if k % 2 else _LINK.sub(rewritten, p) for k, p in enumerate(parts))
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Formulas as MathML."""
+    """Convert formulas to MathML."""
     content = re.sub(
         r'<div class="arithmatex">\\\[(.*?)\\\]</div>',
         lambda m: convert(html.unescape(m[1]).strip(), display="block"),
@@ -93,79 +93,112 @@ def on_page_content(content: str, **_: Any) -> str:
     )
 
 
-def _place(path: str) -> str:
-    """Where the site has a file of the repository."""
+def _site_path(path: str) -> str:
+    """Path on the site of a file of the repository."""
     for page, source in TEXTS.items():
         if path == source:
             return page
     return path.removeprefix("docs/")
 
 
-def public_names() -> dict[str, dict[str, str]]:
-    """Public names of the package and of each subpackage, by the module that has them.
+def packages() -> list[str]:
+    """The package and its subpackages at any depth, as dotted names."""
+    folders = [path.parent for path in sorted(PACKAGE.rglob("__init__.py"))]
+    return [".".join(folder.relative_to(PACKAGE.parent).parts) for folder in folders]
 
-    They are what an `__init__.py` imports `as` itself.
-    """
-    folders = [PACKAGE, *(p.parent for p in sorted(PACKAGE.glob("*/__init__.py")))]
+
+def source_of(module: str) -> tuple[ast.Module, bool]:
+    """The parsed source of a module, and whether it is a package."""
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    return ast.parse(file.read_text(encoding="utf-8")), path.is_dir()
+
+
+def imported_names(package: str) -> dict[str, str]:
+    """Names that a package imports `as` themselves, which are public, and their modules."""
     found = {}
-    for folder in folders:
-        dotted = ".".join(folder.relative_to(PACKAGE.parent).parts)
-        names = {}
-        for node in ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ImportFrom) and node.level == 1:
-                for alias in node.names:
-                    if alias.asname == alias.name and not alias.name.startswith("_"):
-                        names[alias.name] = f"{dotted}.{node.module}"
-        found[dotted] = names
+    # Those of the top-level package are inside `if TYPE_CHECKING`.
+    for node in ast.walk(source_of(package)[0]):
+        if isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = parts[: len(parts) - node.level + 1]
+            for alias in node.names:
+                if alias.asname == alias.name and not alias.name.startswith("_"):
+                    found[alias.name] = ".".join([*base, node.module or ""])
     return found
 
 
+def defining_module(module: str, name: str) -> str:
+    """The module that defines a name, following imports of packages."""
+    if source_of(module)[1]:
+        names = imported_names(module)
+        if name in names:
+            return defining_module(names[name], name)
+    return module
+
+
 def first_sentence(module: str, name: str) -> str:
-    """How the docstring of a function or class begins, read without importing anything."""
-    path = PACKAGE.parent.joinpath(*module.split("."))
-    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+    """First sentence of the docstring of a function or class, read without importing it."""
+    for node in source_of(module)[0].body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name:
             text = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
             return re.split(r"(?<=\w)[.;:] ", text)[0].rstrip(".").replace("|", "\\|") + "."
-        if isinstance(node, ast.ImportFrom) and any(a.name == name for a in node.names):
-            above = node.level - path.is_dir()  # packages to climb from this module
-            base = module.split(".")[: len(module.split(".")) - above]
-            return first_sentence(".".join([*base, node.module or ""]), name)
     return ""
 
 
 def reference_pages() -> dict[str, str]:
-    """Markdown of the reference: a page for each subpackage, and one that leads to them."""
-    every = public_names()
-    pages = {}
-    front = every.pop("xavatar_jax")
+    """Markdown of the reference: an index, and a page for each subpackage.
+
+    A name is documented on the page of the innermost package that defines it; other packages that
+    export it link there.
+    """
+    top, *inner = packages()
+    where = {
+        package: {n: defining_module(m, n) for n, m in imported_names(package).items()}
+        for package in (top, *inner)
+    }
+
+    def home(module: str) -> str:
+        """The innermost package of a module."""
+        return max((p for p in inner if f"{module}.".startswith(f"{p}.")), key=len)
+
+    def page(package: str) -> str:
+        return package.removeprefix(f"{top}.")
+
+    def ordered(names: dict[str, str]) -> list[tuple[str, str]]:
+        return sorted(names.items(), key=lambda item: item[0].lower())
+
     lines = [
         "# Reference",
         "",
-        "Every public name, from its docstring. `import xavatar_jax as xa` has those of the first",
-        "table; the rest are imported from their package.",
+        "All public names, documented from their docstrings. The names of the first table are",
+        "available from `import xavatar_jax as xa`; others are imported from their package.",
         "",
-        "| Name | Package | What it is |",
+        "| Name | Package | Description |",
         "|---|---|---|",
     ]
-    for name, module in sorted(front.items(), key=lambda item: item[0].lower()):
-        package = module.removeprefix("xavatar_jax.").split(".")[0]
-        target = f"{every[f'xavatar_jax.{package}'][name]}.{name}"
-        what = first_sentence(*target.rsplit(".", 1))
-        lines.append(f"| [`xa.{name}`][{target}] | [`{package}`]({package}.md) | {what} |")
-    lines += ["", "| Package | What it holds |", "|---|---|"]
-    for dotted, names in every.items():
-        package = dotted.split(".")[1]
-        source = (PACKAGE / package / "__init__.py").read_text(encoding="utf-8")
-        summary = (ast.get_docstring(ast.parse(source)) or "").strip()
-        lines.append(f"| [`{package}`]({package}.md) | {summary.splitlines()[0]} |")
-        body = [f"# {package}", "", summary, ""]
+    for name, module in ordered(where[top]):
+        own = page(home(module))
+        what = first_sentence(module, name)
+        lines.append(f"| [`xa.{name}`][{module}.{name}] | [`{own}`]({own}.md) | {what} |")
+    lines += ["", "| Package | Contents |", "|---|---|"]
+    pages = {}
+    for package in inner:
+        names = where[package]
+        if not names and package.count(".") > 1:
+            continue
+        own = page(package)
+        summary = (ast.get_docstring(source_of(package)[0]) or "").strip()
+        lines.append(f"| [`{own}`]({own}.md) | {summary.splitlines()[0]} |")
+        body = [f"# {own}", "", summary, ""]
         if names:
             some = ", ".join(sorted(names, key=str.lower)[:2])
-            body += ["```python", f"from {dotted} import {some}", "```", ""]
-        # By the module that defines it: `avatar.fit` is a module as well as a function.
-        body += [f"::: {names[name]}.{name}\n" for name in sorted(names, key=str.lower)]
-        pages[f"api/{package}.md"] = "\n".join(body)
+            body += ["```python", f"from {package} import {some}", "```", ""]
+        others = [(n, m) for n, m in ordered(names) if home(m) != package]
+        if others:
+            links = ", ".join(f"[`{name}`][{module}.{name}]" for name, module in others)
+            body += [f"Also exported: {links}.", ""]
+        body += [f"::: {m}.{n}\n" for n, m in ordered(names) if home(m) == package]
+        pages[f"api/{own}.md"] = "\n".join(body)
     pages["api/index.md"] = "\n".join(lines) + "\n"
     return pages

@@ -8,8 +8,9 @@ if TYPE_CHECKING:
     from .avatar import Avatar as Avatar
     from .avatar import CellSizes as CellSizes
     from .avatar import evaluate as evaluate
-    from .avatar import fit as fit
     from .avatar import load_avatar as load_avatar
+    from .avatar import occupancy as occupancy
+    from .avatar import query as query
     from .body import BodyModel as BodyModel
     from .body import BodyParams as BodyParams
     from .body import body_from_model as body_from_model
@@ -18,13 +19,11 @@ if TYPE_CHECKING:
     from .body import load_body as load_body
     from .body import params_from_model as params_from_model
     from .body import pose_body as pose_body
-    from .body import synthetic_body as synthetic_body
     from .correspondence import Broyden as Broyden
     from .correspondence import find_correspondences as find_correspondences
     from .correspondence import part_groups as part_groups
     from .datasets import load_data as load_data
     from .datasets import load_frames as load_frames
-    from .datasets import synthetic_capture as synthetic_capture
     from .export import read_mesh as read_mesh
     from .export import write_obj as write_obj
     from .export import write_ply as write_ply
@@ -32,14 +31,18 @@ if TYPE_CHECKING:
     from .frames import Frames as Frames
     from .kinematics import skin_points as skin_points
     from .meshing import Mesh as Mesh
+    from .methods import Fit as Fit
+    from .methods import fit as fit
+    from .methods.xavatar import FitConfig as FitConfig
+    from .methods.xavatar import paper as paper
+    from .methods.xavatar import quick as quick
     from .motion import Motion as Motion
     from .motion import MotionNotice as MotionNotice
     from .motion import concat as concat
     from .motion import load_motion as load_motion
     from .motion import save_motion as save_motion
-    from .training import FitConfig as FitConfig
-    from .training import paper as paper
-    from .training import quick as quick
+    from .synthetic import synthetic_body as synthetic_body
+    from .synthetic import synthetic_capture as synthetic_capture
     from .viewer import HtmlPage as HtmlPage
     from .viewer import Viewer as Viewer
     from .viewer import view as view
@@ -47,7 +50,7 @@ if TYPE_CHECKING:
 
 # What is imported on first use, so that `xavatar --help` does not wait for JAX.
 _HOMES = {
-    "avatar": ("Avatar", "CellSizes", "evaluate", "fit", "load_avatar"),
+    "avatar": ("Avatar", "CellSizes", "evaluate", "load_avatar", "occupancy", "query"),
     "body": (
         "BodyModel",
         "BodyParams",
@@ -57,16 +60,17 @@ _HOMES = {
         "load_body",
         "params_from_model",
         "pose_body",
-        "synthetic_body",
     ),
     "correspondence": ("Broyden", "find_correspondences", "part_groups"),
-    "datasets": ("load_data", "load_frames", "synthetic_capture"),
+    "datasets": ("load_data", "load_frames"),
     "export": ("read_mesh", "write_obj", "write_ply"),
     "frames": ("Frame", "Frames"),
     "kinematics": ("skin_points",),
     "meshing": ("Mesh",),
+    "methods": ("Fit", "fit"),
+    "methods.xavatar": ("FitConfig", "paper", "quick"),
     "motion": ("Motion", "MotionNotice", "concat", "load_motion", "save_motion"),
-    "training": ("FitConfig", "paper", "quick"),
+    "synthetic": ("synthetic_body", "synthetic_capture"),
     "viewer": ("HtmlPage", "Viewer", "view", "view_html"),
 }
 _NAMES = {name: home for home, names in _HOMES.items() for name in names}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Fit
 from xavatar_jax.fields import GridSpacing
 from xavatar_jax.frames import frames_from_params
-from xavatar_jax.training import prefit
+from xavatar_jax.methods import Fit
+from xavatar_jax.methods.xavatar import start
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SmallRun:
     config = small_config()
     cache = tmp_path_factory.mktemp("prefit")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prefit, "_POINTS", 60_000)  # a rough start is enough
+        patch.setattr(start, "_POINTS", 60_000)  # a rough start is enough
         fit = xa.fit(train, config, body=body, cache=cache, verbose=False)
     return SmallRun(body, train, test, config, fit)

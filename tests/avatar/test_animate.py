@@ -130,12 +130,12 @@ def test_full_mode_gives_meshes_of_their_own(run, params, monkeypatch):
         asked.append((np.asarray(frame.transl), mode))
         return "mesh"
 
-    monkeypatch.setattr(xa.Avatar, "mesh", mesh)
+    monkeypatch.setattr(xa.Avatar, "surface", mesh)
     assert list(animation) == ["mesh"] * 3
     np.testing.assert_allclose(asked[1][0], params.transl[1])
     assert {mode for _, mode in asked} == {"full"}
     for use in (animation.vertices, animation.error, lambda: animation.faces):
-        with pytest.raises(ValueError, match="faces of its own"):
+        with pytest.raises(ValueError, match="its own faces"):
             use()
 
 

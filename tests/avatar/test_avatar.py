@@ -41,7 +41,7 @@ def test_the_start_is_the_mean_shape(run):
 
 
 def test_the_range_heard_is_that_of_the_frames_learned_from(run):
-    geometry = run.fit.avatar.fields.geometry
+    geometry = run.fit.avatar.model.geometry
     pose = np.asarray(run.fit.frames.params.pose)
     turned = Rotation.from_rotvec(pose.reshape(-1, 3)).as_matrix() - np.eye(3)
     turned = turned.reshape(*pose.shape[:2], 9)
@@ -142,10 +142,10 @@ def test_nothing_changes_far_from_the_origin(run):
     here, there = avatar.query(points, frame.params), avatar.query(points + far, moved)
     assert np.asarray(there.found).all()
     assert np.abs(np.asarray(here.x_c - there.x_c)).max() < 2e-4
-    by_point = jax.jacrev(lambda x: avatar.query(x, frame.params).logit.sum())(points)
+    by_point = jax.jacrev(lambda x: avatar.query(x, frame.params).level.sum())(points)
 
     def shifted(transl):
-        return avatar.query(points, replace(frame.params, transl=transl)).logit.sum()
+        return avatar.query(points, replace(frame.params, transl=transl)).level.sum()
 
     by_transl = jax.grad(shifted)(frame.params.transl)
     np.testing.assert_allclose(by_transl, -by_point.sum(0), rtol=1e-3, atol=1e-2)
@@ -166,7 +166,7 @@ def test_occupancy_is_differentiable_in_points_and_pose(run):
             expression=frame.params.expression,
             transl=frame.params.transl,
         )
-        return avatar.query(x, params).logit
+        return avatar.query(x, params).level
 
     pose = frame.params.pose
     by_point, by_pose = jax.jacrev(logits, argnums=(0, 1))(points, pose)
@@ -223,8 +223,8 @@ def test_parameters_of_another_tree_are_refused(run):
 
 
 def test_a_field_without_surface_is_an_error(run):
-    fields = run.fit.avatar.fields
-    empty = eqx.tree_at(lambda f: f.geometry.biases[2], fields, jnp.full(1, -1000.0))
-    avatar = xa.Avatar(run.body, run.fit.avatar.betas, empty, run.config)
+    model = run.fit.avatar.model
+    empty = eqx.tree_at(lambda m: m.geometry.biases[2], model, jnp.full(1, -1000.0))
+    avatar = replace(run.fit.avatar, model=empty)
     with pytest.raises(EmptyLevelSetError):
         avatar.canonical_mesh()

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from xavatar_jax.training import Interrupted, loop
 
 import xavatar_jax as xa
 from xavatar_jax import report
 from xavatar_jax.avatar import Evaluation
 from xavatar_jax.cli import fit as command
 from xavatar_jax.metrics import MeshMetrics, RegionValues
-from xavatar_jax.training import Interrupted, loop
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "fit_grab.py"
 
@@ -50,9 +50,9 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
         # Of the avatar of all these tests, whose surface is there already.
         return evaluate(run.fit.avatar, frames, **{**options, "num_frames": 1})
 
-    monkeypatch.setattr(loop, "initial_fields", lambda *_, **__: run.fit.before.fields)
+    monkeypatch.setattr(loop, "initial_fields", lambda *_, **__: run.fit.before.model)
     # With the grid of the person, whose programs are compiled.
-    monkeypatch.setattr(loop, "settle_on_person", lambda *_, **__: run.fit.avatar.fields)
+    monkeypatch.setattr(loop, "settle_on_person", lambda *_, **__: run.fit.avatar.model)
     monkeypatch.setattr(xa, "fit", noted_fit)
     monkeypatch.setattr(xa, "evaluate", quick_evaluate)
     monkeypatch.setattr(command, "load", lambda options: capture)

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from xavatar_jax.training import History
 
 import xavatar_jax as xa
 from xavatar_jax.report import (
@@ -14,7 +15,6 @@ from xavatar_jax.report import (
     preview,
     write_json,
 )
-from xavatar_jax.training import History
 
 FIGURES = ("cd_mm", "cd_max_mm", "nc", "iou", "iou_near", "iou_box", "count")
 

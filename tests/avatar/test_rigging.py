@@ -106,7 +106,7 @@ def test_losses_are_those_of_the_file(run, motion, file):
     glb, report = file
     avatar = run.fit.avatar
     animation = avatar.animate(motion)
-    every = np.asarray(avatar.neutral_surface.weights).T
+    every = np.asarray(avatar.rest.weights).T
     by_influence, in_all = [], []
     for k in range(len(motion)):
         four = skinned(run, motion, k, glb)

@@ -8,9 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import TOLERANCE, TREES
-
-import xavatar_jax as xa
-from xavatar_jax.avatar import Avatar
 from xavatar_jax.baselines import (
     Baseline,
     body_only,
@@ -18,10 +15,13 @@ from xavatar_jax.baselines import (
     body_only_params,
     kept_joints,
 )
+from xavatar_jax.training import History
+
+import xavatar_jax as xa
+from xavatar_jax.avatar import Avatar
 from xavatar_jax.body import canonical_pose, pose_body
 from xavatar_jax.frames import Frames
 from xavatar_jax.kinematics import KinematicTree
-from xavatar_jax.training import History
 
 WHOLE = ("smplx", "smplh", "smpl")
 

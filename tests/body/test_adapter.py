@@ -159,7 +159,7 @@ def test_what_does_not_fit_is_named(smplx):
         params_from_model(arm, body, {"bend": 0})
     with pytest.raises(ValueError, match=r"identity has turn; the model takes size"):
         body_from_model(arm, identity={"turn": 0})
-    with pytest.raises(ValueError, match=r"names has knee, which are no joints of the model"):
+    with pytest.raises(ValueError, match=r"names has knee, which are not joints of the model"):
         body_from_model(arm, names={"knee": "left_knee"})
     with pytest.raises(ValueError, match=r"the model has .* vertices and 55 joints.*90 and 4"):
         params_from_model(smplx, body, {})

@@ -5,27 +5,25 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-import xavatar_jax as xa
 from xavatar_jax.avatar import Avatar
 from xavatar_jax.cli import main
-from xavatar_jax.fields import MLPShape
-from xavatar_jax.training import GeometryConfig, SkinningConfig, fresh_fields
+from xavatar_jax.fields import GeometrySpec, MLPShape, ModelSpec, SkinningSpec, build_model
 
 
 @pytest.fixture(scope="session")
 def avatar_file(bundled_body, tmp_path_factory) -> Path:
     tiny = MLPShape(width=16, depth=3, octaves=0, skip=(), condition_at=(0,))
-    config = replace(
-        xa.paper(),
-        skinning=SkinningConfig(kind="mlp", mlp=replace(tiny, condition_at=())),
-        geometry=GeometryConfig(kind="mlp", mlp=tiny),
+    spec = ModelSpec(
+        skinning=SkinningSpec(kind="mlp", mlp=replace(tiny, condition_at=())),
+        geometry=GeometrySpec(kind="mlp", mlp=tiny),
     )
     path = tmp_path_factory.mktemp("avatar") / "avatar.npz"
-    fields = fresh_fields(bundled_body, config)
-    Avatar(bundled_body, np.zeros(10), fields, config).save(path)
+    model = build_model(spec, bundled_body, key=jax.random.key(0))
+    Avatar(bundled_body, np.zeros(10), model, spec, options={"preset": "paper"}).save(path)
     return path
 
 

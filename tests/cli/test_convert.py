@@ -16,7 +16,7 @@ from xavatar_jax.report import machine
 def test_there_and_back_through_bvh(call, motion_file, tmp_path):
     bvh, back = tmp_path / "bend.bvh", tmp_path / "back.npz"
     code, said, error = call("convert", motion_file, "--out", bvh, "--body", "bundled")
-    assert (code, said) == (0, f"{bvh}: 7 frames, 30 a second\n")
+    assert (code, said) == (0, f"{bvh}: 7 frames, 30 per second\n")
     assert error.startswith("notice: ")
     assert "expression" in error
     code, *_ = call("convert", bvh, "--out", back, "--body", "bundled", "--quiet")
@@ -29,7 +29,7 @@ def test_there_and_back_through_bvh(call, motion_file, tmp_path):
 def test_rate_stretch_and_frame(call, motion_file, tmp_path):
     out = tmp_path / "a.npz"
     code, said, _ = call("convert", motion_file, "--out", out, "--fps", 60, "--start", 0.1)
-    assert (code, said) == (0, f"{out}: 7 frames, 60 a second\n")
+    assert (code, said) == (0, f"{out}: 7 frames, 60 per second\n")
     with np.load(motion_file) as first, np.load(out) as last:
         assert last["mocap_frame_rate"] == 60
         np.testing.assert_allclose(last["poses"][::2], first["poses"][3:], atol=1e-6)
@@ -37,7 +37,7 @@ def test_rate_stretch_and_frame(call, motion_file, tmp_path):
         np.testing.assert_allclose(last["poses"][1], between, atol=1e-6)
     one = tmp_path / "pose.pkl"
     code, said, _ = call("convert", motion_file, "--out", one, "--frame", 6, "--body", "bundled")
-    assert (code, said) == (0, f"{one}: 1 frame, 30 a second\n")
+    assert (code, said) == (0, f"{one}: 1 frame, 30 per second\n")
     folder = tmp_path / "poses"
     code, *_ = call("convert", motion_file, "--out", folder, "--body", "bundled")
     assert code == 0
@@ -59,7 +59,7 @@ def test_rate_stretch_and_frame(call, motion_file, tmp_path):
             "nan.npz: poses is not finite in 1 frames, first in frame 2",
         ),
         (["none.npz", "--out", "a.npz"], "none.npz"),
-        (["MOTION", "--out", "nan.npz/a.npz"], "is no folder"),
+        (["MOTION", "--out", "nan.npz/a.npz"], "is not a folder"),
     ],
 )
 def test_wrong_motions(call, motion_file, tmp_path, monkeypatch, words, complaint):
@@ -125,7 +125,7 @@ def test_info_of_this_machine(call, monkeypatch, tmp_path):
     assert facts["cache"]["size"] == "2.0 MB in 1 files"
     lines = [line for line in call("info")[1].splitlines() if line.startswith("GPU ")]
     assert len(lines) == 1
-    assert 'pip install "xavatar-jax[gpu]"' in lines[0]
+    assert 'pip install -e ".[gpu]"' in lines[0]
 
 
 def test_advice_is_for_gpus_that_are_not_used(monkeypatch):

@@ -68,18 +68,18 @@ def test_the_name_says_what_is_written(call, avatar_file, motion_file, tmp_path)
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--out", "a.fbx"], "nothing is written to .fbx"),
+        (["--out", "a.fbx"], "unknown format .fbx"),
         (["MOTION", "--out", "a.npz"], "leave out MOTION"),
-        (["--out", "folder"], "one MOTION is needed"),
-        (["MOTION", "MOTION", "--out", "a.ply"], "one MOTION is needed"),
-        (["--frame", "3", "--out", "a.ply"], "--frame is for"),
+        (["--out", "folder"], "needs one MOTION, found"),
+        (["MOTION", "MOTION", "--out", "a.ply"], "needs one MOTION, found"),
+        (["--frame", "3", "--out", "a.ply"], "--frame applies to one mesh"),
         (["MOTION", "--frame", "7", "--out", "a.ply"], "frames 0 to 6"),
         (["MOTION", "--fps", "-1", "--out", "a.glb"], "must be positive"),
         (["--expressions", "11", "--out", "a.glb"], "has 10 coefficients"),
-        (["--out", "there/file/a.glb"], "is no folder"),
-        (["--out", "there"], "there already"),
-        (["MOTION", "--out", "there"], "there already"),
-        (["--out", "there.glb"], "there is a folder of this name"),
+        (["--out", "there/file/a.glb"], "is not a folder"),
+        (["--out", "there"], "already exists"),
+        (["MOTION", "--out", "there"], "already exists"),
+        (["--out", "there.glb"], "this is a folder; give a file name"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_written_is_said_first(
@@ -91,7 +91,7 @@ def test_what_cannot_be_written_is_said_first(
     (tmp_path / "there.glb").mkdir()
     before = sorted(tmp_path.rglob("*"))
     if words == ["--out", "there"]:
-        complaint = "one MOTION is needed"
+        complaint = "needs one MOTION, found"
     words = [motion_file if word == "MOTION" else word for word in words]
     code, said, error = call("export", avatar_file, *words)
     assert (code, said) == (2, "")
@@ -104,7 +104,7 @@ def test_a_folder_that_takes_no_files(call, avatar_file, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
     code, _, error = call("export", avatar_file, "--out", tmp_path / "a.glb")
     assert code == 2
-    assert f"since {tmp_path} takes no files" in error
+    assert f"because {tmp_path} is not writable" in error
 
 
 @pytest.mark.parametrize(("failure", "code"), [
@@ -162,7 +162,7 @@ def test_files_that_are_something_else(call, avatar_file, motion_file, tmp_path)
     assert "strange.dat: not recognised as a motion" in error
     code, _, error = call("export", motion_file, *out)
     assert code == 2
-    assert "not one of our files" in error
+    assert "so xavatar_jax did not write it" in error
     code, _, error = call("export", tmp_path / "missing.npz", *out)
     assert code == 2
     assert "missing.npz" in error
@@ -182,7 +182,7 @@ def test_another_body_is_refused(call, avatar_file, family_paths, tmp_path):
     assert error.rstrip().endswith("(On the command line: --body.)")
     code, _, error = call("export", moved, "--body", family_paths["smplx"], *out)
     assert code == 2
-    assert "learned on another body" in error
+    assert "fitted on another body" in error
     code, *_ = call("export", moved, "--body", "bundled", *out)
     assert code == 0
 
@@ -212,13 +212,14 @@ def test_pictures_that_end_early_leave_nothing(
     from xavatar_jax.report import pictures
 
     def stop(*_, **__):
-        if len(list(tmp_path.glob(".*/*.png"))) == 2:
-            raise KeyboardInterrupt
-        return np.zeros((4, 4, 3), np.uint8)
+        for _ in range(2):
+            yield np.zeros((4, 4, 3), np.uint8)
+        assert len(list(tmp_path.glob(".*/*.png"))) == 2
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(pictures, "render_mesh", stop)
+    monkeypatch.setattr(pictures, "render_sequence", stop)
     code, _, error = call("animate", avatar_file, motion_file, "--out", tmp_path / "new")
-    assert (code, error.strip()) == (130, "stopped: nothing is half-written.")
+    assert (code, error.strip()) == (130, "stopped; no file was left incomplete.")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -226,7 +227,7 @@ def test_pictures_that_end_early_leave_nothing(
     ("words", "complaint"),
     [
         (["--out", "a.mp4"], "ffmpeg"),
-        (["--out", "a.webp", "--size", "0", "4"], "at least one pixel"),
+        (["--out", "a.webp", "--size", "0", "4"], "must be at least one pixel"),
         (["--out", "a.webp", "--start", "9"], "seconds"),
         (["--out", "a.webp", "--fps", "nan"], "must be positive"),
     ],

@@ -6,13 +6,17 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax
+import numpy as np
 import pytest
 
 import xavatar_jax as xa
-from xavatar_jax.avatar import Avatar
+from xavatar_jax import methods
+from xavatar_jax.avatar import Avatar, BodyOnlyAvatar, body_only
 from xavatar_jax.cli import fit
+from xavatar_jax.fields import build_model
+from xavatar_jax.learning import TrainingError
 from xavatar_jax.meshing import EmptyLevelSetError
-from xavatar_jax.training import TrainingError
 
 
 def config_of(*words: str) -> xa.FitConfig:
@@ -52,11 +56,17 @@ def test_every_other_entry_is_an_option():
     ("words", "complaint"),
     [
         (["--config.steps", "3"], "an option of its own, --steps"),
-        (["--config.train-frames=3"], "an option of its own, --train-frames"),
+        (["--config.train-frames=3"], "use the option --train-frames"),
         (["--config.losses.surfac", "3"], "Unrecognized"),
         (["--config.losses.surface", "much"], "surface"),
         (["--eval-frames", "0"], 'a number above zero or "all"'),
         (["--preset", "slow"], "preset"),
+        (["--method", "pifu"], "method"),
+        (["--method", "scanimate", "--steps", "5"], "--steps is not an option of scanimate"),
+        (
+            ["--method", "scanimate", "--prefit-steps", "5"],
+            "--prefit-steps is not an option of scanimate",
+        ),
         (["--data", "nowhere"], "nowhere"),
         (["--body", "nowhere.npz"], "no body model found"),
     ],
@@ -90,6 +100,19 @@ def test_help_of_the_config_is_apart(call):
     assert "--config.steps" not in full
 
 
+@pytest.mark.parametrize("method", ["snarf", "scanimate"])
+def test_other_methods_have_their_own_configs(call, method):
+    given = ["--method", method, "--minutes", "2", "--seed", "3", "--config.clip", "0.5"]
+    if method == "snarf":
+        given = [*given[:-2], "--steps", "7"]
+    expected = methods.METHODS[method].presets["quick"]()
+    change = {"steps": 7} if method == "snarf" else {"clip": 0.5}
+    assert config_of(*given) == replace(expected, minutes=2, seed=3, **change)
+    code, full, _ = call("fit", "--method", method, "--config.help")
+    assert code == 0
+    assert ("--config.shape.steps" in full) == (method == "scanimate")
+
+
 def test_what_it_asks_of_the_library(call, tmp_path, monkeypatch, bundled_body):
     asked = {}
     capture = SimpleNamespace(body=bundled_body, name="case", train=[1], test=[2])
@@ -100,7 +123,7 @@ def test_what_it_asks_of_the_library(call, tmp_path, monkeypatch, bundled_body):
 
     monkeypatch.setattr(xa, "synthetic_body", lambda *_: bundled_body)
     monkeypatch.setattr(xa, "synthetic_capture", lambda *_, **__: capture)
-    monkeypatch.setattr(xa, "fit", stop)
+    monkeypatch.setattr(methods, "METHODS", {"xavatar": methods.Method(stop, methods.PRESETS)})
     out = tmp_path / "out"
     code, said, error = call("fit", "--out", out, "--resume", "--config.losses.bone", 2)
     assert (code, error) == (1, "error: the occupancy term is nan at step 3\n")
@@ -115,7 +138,7 @@ def test_what_it_asks_of_the_library(call, tmp_path, monkeypatch, bundled_body):
     file.write_text("")
     code, _, error = call("fit", "--out", file / "out")
     assert code == 2
-    assert "is no folder" in error
+    assert "is not a folder" in error
 
 
 def test_a_field_without_a_surface_ends_it_with_advice(call, tmp_path, monkeypatch, bundled_body):
@@ -130,7 +153,8 @@ def test_a_field_without_a_surface_ends_it_with_advice(call, tmp_path, monkeypat
     capture = SimpleNamespace(body=bundled_body, name="case", train=[1], test=[2])
     monkeypatch.setattr(xa, "synthetic_body", lambda *_: bundled_body)
     monkeypatch.setattr(xa, "synthetic_capture", lambda *_, **__: capture)
-    monkeypatch.setattr(xa, "fit", lambda *_, **__: done)
+    method = methods.Method(lambda *_, **__: done, methods.PRESETS)
+    monkeypatch.setattr(methods, "METHODS", {"xavatar": method})
     monkeypatch.setattr(xa, "evaluate", evaluate)
     code, _, error = call("fit", "--out", tmp_path, "--quiet")
     assert code == 1
@@ -154,6 +178,22 @@ def test_evaluate_prints_and_writes_the_same_figures(call, avatar_file, tmp_path
     assert str(out) in said
 
 
+@pytest.mark.usefixtures("coarse")
+def test_evaluate_takes_baselines_without_fingers(call, bundled_body, avatar_file, tmp_path):
+    cut = body_only(bundled_body)
+    spec = xa.load_avatar(avatar_file).spec
+    model = build_model(spec, cut, key=jax.random.key(0))
+    own = Avatar(cut, np.zeros(10), model, spec, method="snarf", options={"seed": 4})
+    BodyOnlyAvatar(bundled_body, own).save(tmp_path / "snarf.npz")
+    out = tmp_path / "metrics.json"
+    code, _, error = call(
+        *("evaluate", tmp_path / "snarf.npz", "--eval-frames", 1, "--out", out, "--quiet")
+    )
+    assert (code, error) == (0, "")
+    record = json.loads(out.read_text())
+    assert (record["frames"], record["seed"]) == (1, 4)
+
+
 def test_evaluate_splits_as_the_avatar_was_learned(call, avatar_file, tmp_path, monkeypatch):
     asked = []
 
@@ -163,8 +203,7 @@ def test_evaluate_splits_as_the_avatar_was_learned(call, avatar_file, tmp_path, 
 
     body = xa.load_avatar(avatar_file).body
     avatar = xa.load_avatar(avatar_file, body=body)
-    avatar = Avatar(body, avatar.betas, avatar.fields, replace(avatar.config, seed=5))
-    avatar.save(tmp_path / "five.npz")
+    replace(avatar, options={"seed": 5}).save(tmp_path / "five.npz")
     monkeypatch.setattr(xa, "load_data", stop)
     for more in ((), ("--seed", 2, "--flat-hand-mean", "False")):
         call("evaluate", tmp_path / "five.npz", "--data", tmp_path, *more)
@@ -174,11 +213,11 @@ def test_evaluate_splits_as_the_avatar_was_learned(call, avatar_file, tmp_path, 
 def test_evaluate_looks_at_its_input_first(call, avatar_file, motion_file, tmp_path):
     code, _, error = call("evaluate", motion_file, "--out", tmp_path / "a.json")
     assert code == 2
-    assert "not one of our files" in error
+    assert "so xavatar_jax did not write it" in error
     code, _, error = call("evaluate", avatar_file, "--data", tmp_path / "no")
     assert code == 2
     assert "No data folder" in error
     code, _, error = call("evaluate", avatar_file, "--out", tmp_path)
     assert code == 2
-    assert "there is a folder of this name" in error
+    assert "this is a folder; give a file name" in error
     assert list(tmp_path.iterdir()) == []

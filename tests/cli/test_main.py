@@ -20,9 +20,9 @@ import xavatar_jax as xa
 from xavatar_jax import cli
 from xavatar_jax.cli.failures import exit_code, in_options, notices_as_lines
 from xavatar_jax.cli.options import option_names
+from xavatar_jax.learning import Interrupted, TrainingError
 from xavatar_jax.meshing import EmptyLevelSetError
 from xavatar_jax.motion import MotionNotice
-from xavatar_jax.training import Interrupted, TrainingError
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = Path(xa.__file__).parent
@@ -93,10 +93,10 @@ def test_help_of_a_command_names_every_option(call, name, monkeypatch):
         (EmptyLevelSetError("no surface"), 1, "error: no surface"),
         (MemoryError("40 GB"), 1, "error: out of memory. 40 GB"),
         (TypeError("a fault"), 1,
-         "error: TypeError: a fault; the same command with --debug shows where"),
-        (KeyboardInterrupt(), 130, "stopped: nothing is half-written."),
+         "error: TypeError: a fault (run the same command with --debug for the traceback)"),
+        (KeyboardInterrupt(), 130, "stopped; no file was left incomplete."),
         (Interrupted("kept.", step=3, signal=15, fitted=None), 143,
-         "kept. On the command line that is: the same command with --resume."),
+         "kept. On the command line: run the same command with --resume."),
         (SystemExit(2), 2, ""),
     ],
 )  # fmt: skip

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from xavatar_jax.correspondence import (
-    PAIR_ROWS,
+    MIN_DETERMINANT,
     Broyden,
     StartTable,
     find_correspondences,
     implicit_root,
+    pair_rows,
     search_field,
     start_table,
 )
-from xavatar_jax.correspondence.implicit import MIN_DETERMINANT
 from xavatar_jax.fields import AbstractSkinningField, skin_with_jacobian
 from xavatar_jax.kinematics import KinematicTree
 
@@ -257,7 +257,7 @@ def test_where_a_limb_lies_on_itself_both_places_are_found(rng, bend):
     )
     full = start_table(tree, "full", groups={"full": (0, 1)})
     labels = jnp.zeros(len(points), int)
-    pairs = jnp.full(len(points), int(PAIR_ROWS[0, 2]))
+    pairs = jnp.full(len(points), int(pair_rows(5)[0, 2]))
     chain = Chain(jnp.asarray(20.0))
     for rows, table in ((labels, full), (pairs, one_each)):
         found = search_field(chain, points, rows, transforms, table)

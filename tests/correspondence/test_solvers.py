@@ -69,6 +69,37 @@ def test_a_wrong_first_estimate_is_mended(x64):
     assert int(found.stats["num_steps"]) > 2
 
 
+@pytest.mark.parametrize("size", [1e-1, 1e-3, 1e-6])
+def test_the_update_meets_the_secant_condition(x64, rng, size):
+    """The new estimate maps the last change of the residual to the last step, at any scale."""
+    target = size * jnp.asarray(rng.normal(size=3))
+    start = jnp.asarray(rng.normal(size=3)) * size
+
+    def skew(y, args):
+        return jnp.asarray(A) @ y + y**2 / size - args
+
+    solver, no_tags = Broyden(), frozenset()
+    options = {"inverse_jacobian": jnp.diag(jnp.array([0.3, 0.4, 0.2]))}
+    call = lambda y, args: (skew(y, args), None)  # noqa: E731
+    state = solver.init(call, start, target, options, None, None, no_tags)
+    for _ in range(4):
+        y, after, _ = solver.step(call, start, target, {}, state, no_tags)
+        mapped = after.inverse_jacobian @ (after.residual - state.residual)
+        np.testing.assert_allclose(mapped, y - start, atol=1e-12 * size)
+        start, state = y, after
+
+
+def test_an_update_without_information_stays_finite():
+    """A step after which the residual is the same gives no secant, and no NaN."""
+    flat = lambda y, args: (jnp.ones(3), None)  # noqa: E731
+    solver, no_tags = Broyden(), frozenset()
+    state = solver.init(
+        flat, jnp.zeros(3), None, {"inverse_jacobian": jnp.eye(3)}, None, None, no_tags
+    )
+    _, after, _ = solver.step(flat, jnp.zeros(3), None, {}, state, no_tags)
+    assert np.isfinite(after.inverse_jacobian).all()
+
+
 def test_vmap(x64):
     scales = jnp.array([0.5, 1.0, 2.0])
     start = jnp.array([1.0, 2.0])

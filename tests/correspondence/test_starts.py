@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TREES
+from helpers import TREES, refused
 
-from xavatar_jax.body import PARTS
-from xavatar_jax.correspondence import PAIR_ROWS, Group, check_bones, part_groups, start_table
+from xavatar_jax.body import STANDARD_PARTS, Group, Part, Parts, part_groups
+from xavatar_jax.correspondence import check_bones, pair_rows, start_table
 from xavatar_jax.correspondence.starts import pull_back_all
 from xavatar_jax.kinematics import KinematicTree, axis_angle_to_matrix
 
@@ -62,7 +64,7 @@ def test_a_tree_with_other_names_falls_back_to_all_it_has():
     assert all(group == Group((0, 1, 2, 3)) for group in groups.values())
     table = start_table(tree)
     assert table.mask.all()
-    np.testing.assert_array_equal(table.index, np.tile(np.arange(4), (len(PARTS), 1)))
+    np.testing.assert_array_equal(table.index, np.tile(np.arange(4), (len(STANDARD_PARTS), 1)))
 
 
 def rows(table):
@@ -86,9 +88,9 @@ def test_the_table_lists_each_parts_group(kind, starts, of, one):
     tree = TREES[kind]
     table = start_table(tree, starts)
     groups = part_groups(tree, of)
-    assert table.index.shape == table.mask.shape == (len(PARTS), table.width)
-    for row, part in zip(rows(table), PARTS, strict=True):
-        group = groups[one or part]
+    assert table.index.shape == table.mask.shape == (len(STANDARD_PARTS), table.width)
+    for row, part in zip(rows(table), STANDARD_PARTS, strict=True):
+        group = groups[one or part.name]
         assert row == (*group.bones, *(tree.num_joints + j for j in group.joints))
     # The padding too.
     assert ((table.index >= 0) & (table.index < 2 * tree.num_joints)).all()
@@ -98,12 +100,13 @@ def test_a_pair_of_parts_takes_the_starts_of_both():
     table = start_table(TREES["smplx"], "paper", pairs=True)
     found = rows(table)
     assert len(found) == 15
+    pairs = pair_rows(5)
     for a in range(5):
-        assert PAIR_ROWS[a, a] == a
+        assert pairs[a, a] == a
         for b in range(5):
-            assert PAIR_ROWS[a, b] == PAIR_ROWS[b, a]
-            assert found[PAIR_ROWS[a, b]] == tuple(sorted({*found[a], *found[b]}))
-    assert sorted(np.unique(PAIR_ROWS)) == list(range(15))
+            assert pairs[a, b] == pairs[b, a]
+            assert found[pairs[a, b]] == tuple(sorted({*found[a], *found[b]}))
+    assert sorted(np.unique(pairs)) == list(range(15))
 
 
 def test_groups_may_be_overridden():
@@ -121,8 +124,23 @@ def test_groups_may_be_overridden():
         start_table(tree, groups={"body": (0, 55)})
     with pytest.raises(ValueError, match=r"start joints of body: bone 55 is out of range for 55"):
         start_table(tree, groups={"body": Group((0,), joints=(55,))})
-    with pytest.raises(ValueError, match=r"unknown start set 'all'"):
+    with refused(r"unknown start set 'all'"):
         start_table(tree, "all")  # pyright: ignore[reportArgumentType]
+
+
+def test_a_body_with_its_own_parts_starts_where_they_say(family):
+    """A body of a trunk and a tail: two rows, their pair, and the paper's groups apart."""
+    tree = KinematicTree(("root", "tail1", "tail2"), (-1, 0, 1))
+    table = (
+        Part("trunk", starts=Group((0,)), paper_starts=Group((0, 1))),
+        Part("tail", starts=Group((1, 2), (2,)), paper_starts=Group((2,))),
+    )
+    parts = Parts(np.zeros(0, np.int8), table, all_starts=Group((0, 1, 2)))
+    body = replace(family["smpl"], tree=tree, parts=parts)
+    assert rows(start_table(body, pairs=True)) == [(0,), (1, 2, 5), (0, 1, 2, 5)]
+    assert rows(start_table(body, "paper")) == [(0, 1), (2,)]
+    assert rows(start_table(body, "full")) == [(0, 1, 2)] * 2
+    np.testing.assert_array_equal(pair_rows(2), [[0, 2], [2, 1]])
 
 
 def test_starts_undo_one_bone_or_half_of_two(rng):

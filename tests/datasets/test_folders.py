@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from xavatar_jax.body import BodyParams, load_body, pose_body, pose_groups
 from xavatar_jax.datasets import find_gender, load_data, load_folder, load_frames, load_prepared
+from xavatar_jax.datasets import scans as scans_module
 from xavatar_jax.datasets.capture import CaptureNotice
 from xavatar_jax.files.meshes import read_mesh
 
@@ -327,3 +328,123 @@ def test_a_hand_alone_needs_no_body_pose(family, tmp_path):
     frame = load_frames(tmp_path, body)[0]
     posed = pose_body(body, frame.params).vertices
     np.testing.assert_allclose(frame.vertices, posed, atol=1e-5)
+
+
+def test_a_mesh_is_read_once_for_each_access(toy_body, tmp_path, monkeypatch):
+    for i in range(3):
+        write_frame(tmp_path / "f", f"f{i}", toy_body, i)
+    frames, read = load_frames(tmp_path / "f", toy_body), []
+    monkeypatch.setattr(
+        scans_module, "read_mesh", lambda path: read.append(path.name) or read_mesh(path)
+    )
+    assert all(frame.part_labels is not None for frame in frames)
+    assert read == ["f0.ply", "f1.ply", "f2.ply"]
+
+
+@pytest.mark.parametrize("named", ["transl", "trans", None])
+def test_scale_and_translation_place_the_mesh(toy_body, tmp_path, named):
+    """The mesh is scale * body + translation, as data sets of scans define it."""
+    values = frame_params(4)
+    scale, shift = 0.44, np.array([0.1, 0.2, 0.3])
+    if named is None:
+        values["transl"] = np.zeros(3)
+    mesh = posed_mesh(toy_body, values)
+    expected = np.asarray(mesh.vertices) + shift / scale
+    mesh.vertices = scale * np.asarray(mesh.vertices) + shift
+    mesh.export(tmp_path / "a.ply")
+    stored = {**values, "betas": BETAS, "scale": np.array([scale]), "translation": shift[None]}
+    transl = stored.pop("transl")
+    np.savez(tmp_path / "a.npz", **stored, **({named: transl} if named else {}))
+    with pytest.warns(CaptureNotice, match=r"scales of 0.44 to 0.44; the meshes are divided by"):
+        frame = load_frames(tmp_path, toy_body)[0]
+    np.testing.assert_allclose(frame.vertices, expected, atol=1e-5)
+    posed = pose_body(toy_body, frame.params).vertices
+    np.testing.assert_allclose(frame.vertices, posed, atol=2e-5)
+    np.testing.assert_array_equal(frame.part_labels, toy_body.part_labels)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scale": 0.0}, "scale is 0, expected a number above zero"),
+        ({"scale": np.ones(3)}, r"scale has shape \(3,\), expected 1 numbers"),
+        ({"scale": np.nan}, "scale is not finite"),
+        ({"translation": np.zeros(2)}, r"translation has shape \(2,\), expected 3 numbers"),
+        ({"scale": 0.5}, "do not belong together.*scale and translation"),
+        ({"betas": np.array(["a"])}, "betas has the type <U1, expected real numbers"),
+        ({"transl": np.ones(3) * 1j}, "transl has the type complex128"),
+    ],
+)
+def test_values_that_place_nothing_are_refused(toy_body, tmp_path, changes, message):
+    write_frame(tmp_path, "a", toy_body, 0, **changes)
+    with pytest.raises(ValueError, match=message) as error:
+        load_frames(tmp_path, toy_body)
+    assert str(tmp_path / "a.") in str(error.value)
+
+
+def test_ignored_entries_are_named_once(toy_body, tmp_path):
+    for i in range(3):
+        write_frame(tmp_path, f"f{i}", toy_body, i, focal=np.ones(2), camera=1.0, use_pca=False)
+    with pytest.warns(CaptureNotice, match="ignored entries.*: camera, focal") as said:
+        load_frames(tmp_path, toy_body)
+    assert len(said) == 1
+
+
+def test_the_gender_of_parameter_files_counts(toy_body, tmp_path):
+    for i in range(2):
+        write_frame(tmp_path, f"f{i}", toy_body, i, gender="female")
+    with pytest.raises(ValueError, match=r"is female, but the body .* is neutral"):
+        load_folder(tmp_path, toy_body)
+
+
+def with_scans(prepared, subject, folder, fitted="SMPLX"):
+    """A prepared subject whose sequences hold finer scans in `folder`."""
+    shutil.copytree(prepared, subject)
+    for registered in list(subject.glob("*/*/SMPLX")):
+        (registered.parent / folder).mkdir()
+        for params in registered.glob("*.pkl"):
+            mesh = trimesh.load_mesh(params.with_suffix(".ply"), process=False).subdivide()
+            held = {"vertices": np.asarray(mesh.vertices), "faces": np.asarray(mesh.faces)}
+            name = params.stem.removesuffix("_smplx")
+            (registered.parent / folder / f"{name}.pkl").write_bytes(pickle.dumps(held))
+        registered.rename(registered.parent / fitted)
+    return subject
+
+
+@pytest.mark.parametrize(
+    ("folder", "fitted"),
+    [("meshes_pkl", "smplx"), ("Meshes_PKL", "SMPLX"), ("mesh-pkl", "SMPLX")],
+)
+def test_other_spellings_of_scans_are_read(toy_body, prepared, tmp_path, folder, fitted):
+    capture = load_data(with_scans(prepared, tmp_path / "s", folder, fitted), toy_body)
+    for frame in (*capture.train, *capture.test):
+        assert len(frame.vertices) > 3 * toy_body.num_vertices
+
+
+@pytest.mark.parametrize("folder", ["scans", "raw"])
+def test_scans_that_would_be_ignored_are_an_error(toy_body, prepared, tmp_path, folder):
+    subject = with_scans(prepared, tmp_path / "s", folder)
+    with pytest.raises(ValueError, match=rf"{folder}: meshes that would be ignored.*meshes_pkl"):
+        load_data(subject, toy_body)
+
+
+def test_scans_apart_from_their_parameters_are_an_error_in_a_plain_folder(toy_body, tmp_path):
+    write_frame(tmp_path / "s", "a", toy_body, 0)
+    write_frame(tmp_path / "s", "b", toy_body, 1)
+    (tmp_path / "s/my_scans").mkdir()
+    (tmp_path / "s/my_scans/a.pkl").write_bytes(pickle.dumps({"vertices": np.zeros((3, 3))}))
+    with pytest.raises(ValueError, match="my_scans: scans in a layout that is not supported"):
+        load_folder(tmp_path / "s", toy_body)
+    (tmp_path / "s/my_scans").rename(tmp_path / "s/cameras")
+    with pytest.warns(CaptureNotice, match="cameras: 1 parameter files without meshes are ignored"):
+        load_folder(tmp_path / "s", toy_body)
+
+
+def test_every_kind_of_mesh_file_is_a_frame(toy_body, tmp_path):
+    for i, suffix in enumerate((".ply", ".obj", ".off", ".stl", ".glb")):
+        write_frame(tmp_path, f"f{i}", toy_body, i, mesh=suffix)
+    frames = load_frames(tmp_path, toy_body)
+    assert len(frames) == 5
+    for frame in frames:
+        posed = np.asarray(pose_body(toy_body, frame.params).vertices)
+        np.testing.assert_allclose(np.ptp(frame.vertices, 0), np.ptp(posed, 0), atol=1e-5)

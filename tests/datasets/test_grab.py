@@ -142,13 +142,16 @@ def test_cut_coefficients_are_recorded(toy_body, tmp_path):
     assert all("16 betas given, the body has 10" in notice for notice in notices)
 
 
-def test_frame_rates_must_agree_or_be_resampled(toy_body, tmp_path):
-    write_sequence(tmp_path / "train/a.npz", fps=120.0, count=9)
-    write_sequence(tmp_path / "test/b.npz", fps=30.0, count=3)
-    with pytest.raises(ValueError, match=r"different frame rates \(30, 120\); pass fps="):
-        load_grab(tmp_path, toy_body)
+def test_sequences_keep_their_frame_rates_unless_resampled(toy_body, tmp_path):
+    write_sequence(tmp_path / "train/a.npz", fps=120.0, count=9, betas=BETAS)
+    write_sequence(tmp_path / "test/b.npz", fps=30.0, count=3, betas=BETAS)
+    capture = load_grab(tmp_path, toy_body)
+    assert (len(capture.train), len(capture.test)) == (9, 3)
+    assert np.isnan(capture.fps)
+    assert capture.notices == (f"{tmp_path}: frame rates of 30, 120; each sequence keeps its own.",)
     capture = load_grab(tmp_path, toy_body, fps=30.0)
     assert (len(capture.train), len(capture.test), capture.fps) == (3, 3, 30.0)
+    assert capture == capture  # by identity: arrays have no single truth value
 
 
 def test_an_empty_split_names_the_folder(toy_body, tmp_path):
@@ -214,3 +217,21 @@ def test_a_body_named_otherwise_counts_as_the_gender_it_was_loaded_for(tmp_path,
     assert load_grab(tmp_path / "f", body).gender == "male"
     with pytest.raises(ValueError, match="sequences is neutral, but the body"):
         load_grab(split_folder, body)
+
+
+def test_a_tilde_is_the_home_folder(toy_body, split_folder, monkeypatch):
+    monkeypatch.setenv("HOME", str(split_folder.parent))
+    assert len(load_grab("~/s", toy_body).train) == 7
+    assert len(load_data("~/s", toy_body).train) == 7
+    assert find_gender("~/s") == "neutral"
+
+
+def test_scans_beside_motions_are_not_ignored_silently(toy_body, split_folder):
+    for folder in ("scans", "preview"):
+        (split_folder / folder).mkdir()
+    trimesh.creation.icosphere(1).export(split_folder / "scans/a.ply")
+    with pytest.raises(ValueError, match="scans: scans in a layout that is not supported"):
+        load_data(split_folder, toy_body)
+    (split_folder / "scans/a.ply").rename(split_folder / "preview/a.ply")
+    with pytest.warns(CaptureNotice, match="preview: 1 mesh files are ignored"):
+        load_data(split_folder, toy_body)

@@ -45,14 +45,15 @@ def dense_encoding(rng, spacing=(0.1, 0.05)):
 
 def test_a_dense_level_interpolates_trilinearly(x64, rng):
     encoding = dense_encoding(rng)
-    assert all(shape is not None for shape in encoding.shapes)
+    assert (np.asarray(encoding.shapes) > 0).all()
     assert encoding.width == 4
     points = rng.uniform([-0.2, -0.1, 0.0], [0.2, 0.3, 0.3], (50, 3))
     found = jax.jit(jax.vmap(lambda p: encoding(p)))(points)
     for level, h in enumerate(encoding.spacing):
-        shape, start = encoding.shapes[level], encoding.offsets[level]
+        shape, start = np.asarray(encoding.shapes)[level], int(encoding.offsets[level])
+        origin = np.asarray(encoding.origin)
         values = np.asarray(encoding.table[start : start + np.prod(shape)]).reshape(*shape, 2)
-        axes = [low + h * np.arange(n) for low, n in zip(encoding.origin, shape, strict=True)]
+        axes = [low + h * np.arange(n) for low, n in zip(origin, shape, strict=True)]
         expected = RegularGridInterpolator(axes, values)(points)
         np.testing.assert_allclose(found[:, level], expected, atol=1e-9)
 
@@ -62,7 +63,7 @@ def test_a_hashed_level_reads_the_rows_of_its_corners(x64, rng):
     encoding = HashEncoding(
         np.zeros(3), np.ones(3), spacing=(0.01,), features=3, log2_size=9, key=jax.random.key(1)
     )
-    assert encoding.shapes == (None,)
+    assert not np.asarray(encoding.shapes).any()
     assert encoding.table.shape == (512, 3)
     x = np.array([0.123, 0.456, 0.789])
     cell = np.floor(x / 0.01).astype(int)
@@ -105,6 +106,6 @@ def test_gradient_in_the_point_and_in_the_table(x64, rng):
     found = jax.jit(jax.jacrev(lambda v: encoding(v)))(x)
     expected = central_difference(jax.jit(lambda v: encoding(v)), x)
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    slope = jax.jit(jax.grad(lambda e: jnp.sum(e(jnp.asarray(x)))))(encoding)
+    slope = eqx.filter_jit(eqx.filter_grad(lambda e: jnp.sum(e(jnp.asarray(x)))))(encoding)
     # Interpolation weights of each level sum to one, for each of the two features.
     np.testing.assert_allclose(jnp.sum(slope.table), 4.0, atol=1e-12)

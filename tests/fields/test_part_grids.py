@@ -327,7 +327,7 @@ def test_skinning_jacobian_agrees_with_differences(x64, rng):
 
 
 def test_cover_of_a_table_is_that_of_its_grids(table, inside):
-    assert bool(covers(table, inside).all())
+    assert bool(jax.vmap(table.covers)(inside).all())
     assert not bool(table.covers(jnp.array([3.0, 0, 0])))
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from xavatar_jax.fields.softplus import softplus
+from xavatar_jax.fields.networks import softplus
 
 
 @pytest.mark.parametrize("sharpness", [1.0, 10.0, 100.0])

@@ -9,7 +9,7 @@ import stat
 import numpy as np
 import pytest
 
-from xavatar_jax.files import atomic_folder, atomic_path, cache_dir, save_arrays
+from xavatar_jax.files import atomic_folder, atomic_path, save_arrays
 
 
 class Interrupted(BaseException):
@@ -115,11 +115,3 @@ def test_a_folder_made_meanwhile_by_another_process_stays(tmp_path):
         (target / "theirs").write_text("2")
     assert entries(target) == ["theirs"]
     assert entries(tmp_path) == ["capture"]
-
-
-def test_cache_folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cache_dir() == tmp_path / "xdg" / "xavatar_jax"
-    assert cache_dir().is_dir()
-    assert cache_dir(tmp_path / "mine") == tmp_path / "mine"
-    assert (tmp_path / "mine").is_dir()

@@ -12,8 +12,10 @@ import pytest
 
 from xavatar_jax.files import (
     flatten_named,
+    header_entry,
     load_arrays,
     load_header,
+    refuse_newer,
     save_arrays,
     unflatten_named,
 )
@@ -111,3 +113,54 @@ def test_a_flipped_byte_is_noticed(tmp_path):
     path.write_bytes(bytes(damaged))
     with pytest.raises(ValueError, match=r"a\.npz"):
         load_arrays(path)
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (np.frombuffer(b"[]", np.uint8), "holds a list, expected an object"),
+        (np.frombuffer(b"[" * 100_000, np.uint8), "nested"),
+        (np.frombuffer(b'{"a": 1', np.uint8), "not readable JSON"),
+        (np.frombuffer(b"\xff\xfe", np.uint8), "not readable JSON"),
+        (np.zeros(0, np.uint8), "not readable JSON"),
+        (np.zeros(3), "is no array of bytes"),
+        (np.array({"a": 1}, object), "is no array of bytes"),
+    ],
+)
+def test_damaged_headers_are_errors_that_name_the_file(tmp_path, entry, words):
+    path = tmp_path / "a.npz"
+    np.savez(path, **{"header.json": entry})
+    for load in (load_arrays, load_header):
+        with pytest.raises(ValueError, match=rf"a\.npz.*{words}"):
+            load(path)
+
+
+def test_entries_of_headers_are_checked():
+    header = {"format": "1", "body": {"path": 3}, "step": 1.5, "on": True, "rate": 2}
+    with pytest.raises(ValueError, match=r"a\.npz: .*'format' is '1', expected a whole number"):
+        refuse_newer("a.npz", header, 1, written_by="0.1")
+    with pytest.raises(ValueError, match=r"a\.npz: .*no entry 'format'"):
+        refuse_newer("a.npz", {}, 1, written_by="0.1")
+    for name, kind, words in (
+        ("body.path", str, "is '3', expected text"),
+        ("body.kind", str, "no entry 'body.kind'"),
+        ("step.path", str, "no entry"),
+        ("step", int, "expected a whole number"),
+        ("on", int, "expected a whole number"),
+        ("body", list, "expected a list"),
+    ):
+        with pytest.raises(ValueError, match=rf"a\.npz: .*{words}"):
+            header_entry("a.npz", header, name, kind)
+    assert header_entry("a.npz", header, "rate", float) == 2
+
+
+def test_arrays_that_hold_no_numbers_are_named(tmp_path):
+    arrays = {k: np.asarray(v) for k, v in flatten_named(some_net(1.0)).items()}
+    arrays["scale"] = np.array("word")
+    with pytest.raises(ValueError, match=r"here\.npz: scale holds <U4, expected numbers"):
+        unflatten_named(some_net(0.0), arrays, source="here.npz")
+    np.savez(
+        tmp_path / "a.npz", **{"header.json": np.frombuffer(b"{}", np.uint8)}, x=np.array([None])
+    )
+    with pytest.raises(ValueError, match=r"a\.npz: x holds Python objects"):
+        load_arrays(tmp_path / "a.npz")

@@ -202,3 +202,25 @@ def test_a_mesh_inside_out_is_turned_round(toy_body):
     for frame in frames:
         a, b, c = (frame.vertices[frame.faces[:, k]] - 0.2 for k in range(3))
         assert ((np.cross(b - a, c - a) * a).sum(1) > 0).all()  # outwards from a point inside
+
+
+def test_labels_may_be_a_function_of_the_vertices_that_were_read(toy_body):
+    calls = []
+
+    def load(i):
+        calls.append(i)
+        return TETRA
+
+    frames = Frames(some_params(toy_body, 2), load, part_labels=lambda i, v: i + (v[:, 0] > 0))
+    np.testing.assert_array_equal(frames[1].part_labels, [1, 2, 1, 1])
+    assert calls == [1]
+
+
+def test_frames_are_compared_by_identity(toy_body):
+    frames = tetra_frames(toy_body, (2,))
+    frame = frames[0]
+    assert frame == frame
+    assert frame != frames[0]
+    assert frames == frames
+    assert frames != frames[:]
+    assert len({frame, frames}) == 2

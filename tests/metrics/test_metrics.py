@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from xavatar_jax.geometry import winding_number
 from xavatar_jax.meshing import Mesh
 from xavatar_jax.metrics import mean_metrics, surface_metrics
-from xavatar_jax.metrics.overlap import box_overlap
+from xavatar_jax.metrics.compare import box_overlap
+from xavatar_jax.metrics.solid import Solid
 
 LABELS = np.array([0, 1, 4, 2, 3])
 
@@ -174,3 +176,18 @@ def test_labels_must_fit():
         surface_metrics(box(), box(), label_vertices=np.zeros((3, 3)))
     with pytest.raises(ValueError, match="2 or more"):
         surface_metrics(box(), box(), num_samples=0)
+
+
+def test_points_are_inside_where_the_winding_number_says_so(rng):
+    """Of shapes that overlap, are nested, or have a hole: one by one against all at once."""
+    overlapping = [sphere(0.5), sphere(0.3, (0.5, 0, 0)), sphere(0.2), sphere(0.1, (0, 1.2, 0))]
+    counts = np.cumsum([0, *(s.num_vertices for s in overlapping)])
+    whole = Mesh(
+        np.concatenate([s.vertices for s in overlapping]),
+        np.concatenate([s.faces + n for s, n in zip(overlapping, counts, strict=False)]),
+    )
+    for mesh in (whole, whole.keep_faces(np.arange(whole.num_faces) > 40)):
+        points = rng.uniform(-1, 1.5, (20_000, 3))
+        expected = winding_number(mesh.vertices, mesh.faces, points) > 0.5
+        assert 0.02 < expected.mean() < 0.5
+        assert np.array_equal(Solid(mesh).contains(points), expected)

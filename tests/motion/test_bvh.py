@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 
 import numpy as np
@@ -19,7 +20,7 @@ from xavatar_jax.motion import (
     save_bvh,
     save_motion,
 )
-from xavatar_jax.motion.bvh_joints import NEEDED, match_joints
+from xavatar_jax.motion.joint_names import NEEDED, match_joints
 
 ROOT = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
 TURNS = ROOT[3:]
@@ -249,18 +250,22 @@ def test_skeletons_with_z_up_are_turned(tmp_path, toy_body):
 
 def test_joint_maps_are_taken_and_checked(tmp_path, toy_body):
     joints, width = mixamo(prefix="")
-    odd = [(d, f"b_{n}" if n else n, o, c) for d, n, o, c in joints]
+
+    def odd_name(name):  # in no language
+        return name[::-1].lower()
+
+    odd = [(d, odd_name(n), o, c) for d, n, o, c in joints]
     path = tmp_path / "a.bvh"
     path.write_text(writers.bvh(odd, np.zeros((2, width))))
-    with pytest.raises(ValueError, match=r"no joint for pelvis, head.*b_Hips.*joint_map=") as error:
+    with pytest.raises(ValueError, match=r"no joint for pelvis, head.*spih.*joint_map=") as error:
         load_motion(path, body=toy_body)
     assert "a.bvh" in str(error.value)
-    chosen = {f"b_{theirs}": ours for ours, theirs in NAMES.items()}
+    chosen = {odd_name(theirs): ours for ours, theirs in NAMES.items()}
     motion = quiet(load_motion, path, body=toy_body, joint_map=chosen)
     assert len(motion) == 2
     for bad, message in (
-        (chosen | {"b_Tail": "head"}, "joint_map names b_Tail"),
-        (chosen | {"b_Neck": "throat"}, "leads to throat"),
+        (chosen | {"liat": "head"}, "joint_map names liat"),
+        (chosen | {odd_name("Neck"): "throat"}, "leads to throat"),
         ("daz", "No joint map 'daz'; there are smplx, mixamo, cmu, smpl"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -357,3 +362,209 @@ def test_the_map_is_chosen_by_the_joints_of_the_body(title, names, first):
     found, joints = match_joints(tuple(names), None, "file.bvh")
     assert found == title
     assert names[joints["spine1"]] == first
+
+
+# Skeletons of other programs: names, and rest poses that are no person
+
+# Joint of SMPL-X, its parent, its place in a T-pose.
+TPOSE = {
+    "pelvis": (None, (0, 0.95, 0)), "spine1": ("pelvis", (0, 1.05, 0)),
+    "spine3": ("spine1", (0, 1.27, 0)), "neck": ("spine3", (0, 1.46, 0)),
+    "head": ("neck", (0, 1.57, 0)),
+}  # fmt: skip
+for _side, _sign in (("left", 1), ("right", -1)):
+    for _name, _parent, (_x, _y, _z) in (
+        ("collar", "spine3", (0.06, 1.39, 0)), ("shoulder", "collar", (0.19, 1.41, 0)),
+        ("elbow", "shoulder", (0.46, 1.41, 0)), ("wrist", "elbow", (0.71, 1.41, 0)),
+        ("hip", "pelvis", (0.1, 0.87, 0)), ("knee", "hip", (0.1, 0.47, 0.01)),
+        ("ankle", "knee", (0.1, 0.08, 0)), ("foot", "ankle", (0.1, 0.02, 0.13)),
+    ):  # fmt: skip
+        _above = _parent if _parent in TPOSE else f"{_side}_{_parent}"
+        TPOSE[f"{_side}_{_name}"] = (_above, (_sign * _x, _y, _z))
+CHILDREN = {n: [c for c, (p, _) in TPOSE.items() if p == n] for n in TPOSE}
+
+
+Y_UP = np.eye(3)
+Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)  # from y-up
+
+
+def along(axis):
+    """Axes of every joint with one of them along its bone, as capture suits write them."""
+
+    def axes(name):
+        below = [c for c in CHILDREN[name] if "hip" not in c and "collar" not in c]
+        here = np.array(TPOSE[name][1])
+        bone = np.array(TPOSE[below[0]][1]) - here if below else here - TPOSE[TPOSE[name][0]][1]
+        x = bone / np.linalg.norm(bone)
+        z = np.array([1.0, 0, 0]) if abs(x[0]) < 0.9 else np.array([0, 0, 1.0])
+        y = np.cross(z, x) / np.linalg.norm(np.cross(z, x))
+        return np.roll(np.stack([x, y, np.cross(x, y)], axis=1), "xyz".index(axis), axis=1)
+
+    return axes
+
+
+def upright(name):
+    return np.eye(3)
+
+
+def suit(path, names, axes, world=Y_UP, count=5, seed=0, without=()):
+    """A BVH file of random poses; returns the true places over time, y-up, by joint."""
+    rng = np.random.default_rng(seed)
+    swing = np.cumsum(rng.normal(0, 0.15, (count, len(TPOSE), 3)), axis=0)
+    turned, place = {}, {}
+    for k, (name, (parent, rest)) in enumerate(TPOSE.items()):
+        local = Rotation.from_rotvec(swing[:, k]).as_matrix()
+        if parent is None:
+            turned[name], place[name] = local, np.tile(np.array(rest, float), (count, 1))
+        else:
+            turned[name] = turned[parent] @ local
+            bone = np.array(rest) - TPOSE[parent][1]
+            place[name] = place[parent] + turned[parent] @ bone
+    kept = [n for n in TPOSE if n not in without]
+    listed, columns = [], [100 * place["pelvis"] @ world.T]
+
+    def add(name, depth):
+        parent, rest = TPOSE[name]
+        own = world @ turned[name] @ axes(name)
+        if parent is None:
+            offset, local = np.zeros(3), own
+        else:
+            offset = 100 * axes(parent).T @ (np.array(rest) - TPOSE[parent][1])
+            local = np.swapaxes(world @ turned[parent] @ axes(parent), -1, -2) @ own
+        columns.append(Rotation.from_matrix(local).as_euler("ZXY", degrees=True))
+        listed.append(
+            (depth, names[name], tuple(map(float, offset)), ROOT if parent is None else TURNS)
+        )
+        below = [c for c in CHILDREN[name] if c in kept]
+        for child in below:
+            add(child, depth + 1)
+        if not below:
+            listed.append((depth + 1, "", (0.0, 0.0, 0.0), None))
+
+    add("pelvis", 0)
+    path.write_text(writers.bvh(listed, np.concatenate(columns, axis=1)))
+    return place
+
+
+def worst_angle(body, motion, place, without=()):
+    """Degrees between bones in the file and on the body, the largest of all bones."""
+    posed, names = body_joints(body, motion), body.tree.names
+    pairs = [(p, n) for n, (p, _) in TPOSE.items() if p and n not in without]
+    own = ("pelvis", "spine1", "spine3", "neck")  # these differ between skeletons
+    pairs = [(a, b) for a, b in pairs if a not in own and a[-5:] not in ("ollar", "ankle")]
+    pairs += [("pelvis", "head"), ("right_hip", "left_hip"), ("right_shoulder", "left_shoulder")]
+    one = directions(lambda n: posed[:, names.index(n)], pairs)
+    other = directions(lambda n: place[n], pairs)
+    return np.degrees(np.arccos(np.clip(np.sum(one * other, axis=-1), -1, 1))).max()
+
+
+SMPLX_NAMES = {name: name for name in TPOSE}
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("root", ["along", "upright"])
+@pytest.mark.parametrize("world", [Y_UP, Z_UP], ids=["y-up", "z-up"])
+def test_bones_along_an_axis_of_their_joints(tmp_path, toy_body, axis, root, world):
+    path = tmp_path / "suit.bvh"
+
+    def axes(name):
+        return np.eye(3) if name == "pelvis" and root == "upright" else along(axis)(name)
+
+    place = suit(path, SMPLX_NAMES, axes, world)
+    motion = quiet(load_motion, path, body=toy_body)
+    assert worst_angle(toy_body, motion, place) < 12  # spines and hips differ in shape
+    assert any("is not a person" in notice for notice in motion.notices)
+
+
+@pytest.mark.parametrize("world", [Y_UP, Z_UP], ids=["y-up", "z-up"])
+def test_upright_rest_poses_in_any_world(tmp_path, toy_body, world):
+    """The rest pose stands along y; a rotation of the root turns the person to another axis."""
+    path = tmp_path / "a.bvh"
+    place = suit(path, SMPLX_NAMES, upright, world)
+    with pytest.warns(MotionNotice) as caught:
+        motion = load_motion(path, body=toy_body)
+    said = " ".join(str(w.message) for w in caught)
+    if world is Z_UP:  # nothing says whether the person lies
+        assert worst_angle(toy_body, motion, {n: p @ Z_UP.T for n, p in place.items()}) < 12
+    else:
+        assert worst_angle(toy_body, motion, place) < 12
+    assert "is not a person" not in said
+
+
+def both(left):
+    """Names of both sides from those of the left."""
+    right = str.maketrans({"L": "R", "l": "r"})
+    swapped = {
+        k.replace("left", "right"): v.replace("Left", "Right").replace("left", "right")
+        if "eft" in v else v.translate(right) for k, v in left.items()
+    }  # fmt: skip
+    return left | swapped
+
+
+PARTS = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot")
+TRUNK = ("pelvis", "spine1", "spine3", "neck", "head")
+NAMINGS = {
+    "by joint": ("Hips Chest Chest2 Neck Head",
+        "LeftCollar LeftShoulder LeftElbow LeftWrist LeftHip LeftKnee LeftAnkle LeftToe"),
+    "SMPL in words": ("Pelvis Spine1 Spine3 Neck Head",
+        "Left_collar Left_shoulder Left_elbow Left_wrist Left_hip Left_knee Left_ankle Left_foot"),
+    "game engine": ("Hips Spine UpperChest Neck Head", "LeftShoulder LeftUpperArm LeftLowerArm "
+        "LeftHand LeftUpperLeg LeftLowerLeg LeftFoot LeftToes"),
+    "with underscores": ("pelvis spine_01 spine_02 neck_01 head",
+        "clavicle_l upperarm_l lowerarm_l hand_l thigh_l calf_l foot_l ball_l"),
+    "with points": ("hips spine chest neck head", "shoulder.L upper_arm.L forearm.L hand.L "
+        "thigh.L shin.L foot.L toe.L"),
+    "small letters first": ("hip abdomen chest neck head",
+        "lCollar lShldr lForeArm lHand lThigh lShin lFoot lToe"),
+    "a character's name": ("Bip01_Pelvis Bip01_Spine Bip01_Spine1 Bip01_Neck Bip01_Head",
+        "Bip01_L_Clavicle Bip01_L_UpperArm Bip01_L_Forearm Bip01_L_Hand Bip01_L_Thigh "
+        "Bip01_L_Calf Bip01_L_Foot Bip01_L_Toe0"),
+    "sides at the end": ("Hips Spine Chest Neck Neck1", "Shoulder_L UpperArm_L LowerArm_L Hand_L "
+        "UpperLeg_L LowerLeg_L Foot_L Toes_L"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("without", [(), ("left_foot", "right_foot")], ids=["toes", "no toes"])
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_names_are_read_as_words(tmp_path, toy_body, naming, without):
+    trunk, limbs = (text.split() for text in NAMINGS[naming])
+    left = {f"left_{part}": name for part, name in zip(PARTS, limbs, strict=True)}
+    if naming == "small letters first":
+        names = left | {k.replace("left", "right"): f"r{v[1:]}" for k, v in left.items()}
+    elif "Left" in limbs[0]:
+        names = both(left)
+    else:
+        swap = {"_l": "_r", ".L": ".R", "_L": "_R"}
+        right = {
+            k.replace("left", "right"): next(
+                v.replace(a, b) for a, b in swap.items() if f"{a}_" in f"{v}_" or a in v
+            )
+            for k, v in left.items()
+        }  # fmt: skip
+        names = left | right
+    names |= dict(zip(TRUNK, trunk, strict=True))
+    path = tmp_path / "a.bvh"
+    place = suit(path, names, upright, without=without)
+    motion = quiet(load_motion, path, body=toy_body)
+    assert worst_angle(toy_body, motion, place, without) < 12
+    assert not any("are not used" in notice for notice in motion.notices)
+
+
+def test_a_joint_map_may_be_a_file(tmp_path, toy_body):
+    names = {name: f"bone{k}" for k, name in enumerate(TPOSE)}
+    place = suit(tmp_path / "a.bvh", names, upright)
+    with pytest.raises(ValueError, match="--joint-map FILE"):
+        load_motion(tmp_path / "a.bvh", body=toy_body)
+    table = tmp_path / "names.json"
+    table.write_text(json.dumps({v: k for k, v in names.items()}))
+    for given in (table, str(table)):
+        motion = quiet(load_motion, tmp_path / "a.bvh", body=toy_body, joint_map=given)
+        assert worst_angle(toy_body, motion, place) < 12
+    for content, words in (
+        ("[1]", "is no mapping"),
+        ('{"bone0": 3}', "is no mapping"),
+        ("{", "JSON"),
+    ):
+        table.write_text(content)
+        with pytest.raises(ValueError, match=words):
+            load_motion(tmp_path / "a.bvh", body=toy_body, joint_map=table)

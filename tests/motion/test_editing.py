@@ -153,7 +153,7 @@ def test_following_keeps_the_height(up, height):
 
 def test_joined_motions_have_to_match():
     motion = turning(np.arange(6.0))
-    with pytest.warns(MotionNotice, match="another shape than motion; the first one's is used"):
+    with pytest.warns(MotionNotice, match="its shape differs from that of motion, which is used"):
         joined = concat([motion, turning(np.arange(6.0), betas=np.ones(10))])
     assert len(joined.betas) == 0
     assert len(concat([motion, turning(np.zeros(2), betas=np.zeros(10))])) == 8
@@ -162,7 +162,7 @@ def test_joined_motions_have_to_match():
     other = turning(np.zeros(3), joint_names=("root",))
     for pair, options, message in (
         ((motion, other), {}, "has other joints than"),
-        ((motion, turning(np.zeros(3), fps=60.0)), {}, "60 frames a second and .*resample one"),
+        ((motion, turning(np.zeros(3), fps=60.0)), {}, "60 frames per second and .*resample one"),
         ((motion, turning(np.zeros(3), up="z")), {}, "is z-up and .* y-up; turn one"),
         ((motion, turning(np.zeros(3))), {"blend": 0.2}, "3 frames are fewer than the 6"),
         ((motion, motion), {"blend": -1.0}, "zero or more"),

@@ -11,8 +11,8 @@ import pytest
 import writers
 from helpers import COLUMNS, PARENTS, reference_body, toy_arrays
 from scipy.spatial.transform import Rotation
-
 from xavatar_jax.baselines import body_only
+
 from xavatar_jax.body import SMPLX_TREE, BodyParams, hands_to_relative
 from xavatar_jax.files import UnsafePickleError
 from xavatar_jax.motion import FORMATS, Motion, MotionNotice, load_motion, save_motion
@@ -258,7 +258,7 @@ def test_pymafx_results(tmp_path, body, compress, protocol):
     expected = posed_numbers(body, numbers) @ CAMERA.T
     np.testing.assert_allclose(posed(body, motion), expected, atol=2e-5)
     assert motion.expression.shape == (5, 50)
-    without = read(path, "off by a constant")
+    without = read(path, "displaced by a constant")
     apart = without.transl - motion.transl
     np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-6)
     np.testing.assert_allclose(without.poses, motion.poses, atol=1e-7)
@@ -326,7 +326,7 @@ def test_phalp_results_move_the_body_only(tmp_path, family):
     with pytest.warns(MotionNotice) as caught:
         params = motion.to_params(family["smplx"])
     said = " ".join(str(w.message) for w in caught)
-    assert "betas are of smpl and mean nothing to the smplx body" in said
+    assert "betas are of smpl and have no meaning for the smplx body" in said
     assert "left_hand, right_hand" in said
     np.testing.assert_array_equal(params.betas, 0)
     np.testing.assert_array_equal(params.left_hand_pose, 0)
@@ -645,7 +645,7 @@ def test_losses_of_amass_archives_are_said(tmp_path):
     with pytest.warns(MotionNotice) as caught:
         path = save_motion(tmp_path / "a.npz", motion)
     said = " ".join(str(w.message) for w in caught)
-    for words in ("written as neutral", "betas are of smplh", "s1.ply", "25 frames a second"):
+    for words in ("written as neutral", "betas are of smplh", "s1.ply", "25 frames per second"):
         assert words in said
     with np.load(path) as data:
         assert data["gender"] == "neutral"
@@ -658,7 +658,7 @@ def test_shapes_of_another_model_are_not_passed_on(tmp_path, body, name):
     with pytest.warns(MotionNotice) as caught:
         path = save_motion(tmp_path / name, some_motion(model="smplh"), body=body)
     said = " ".join(str(w.message) for w in caught)
-    assert "betas are of smplh and mean nothing to the smplx body" in said
+    assert "betas are of smplh and have no meaning for the smplx body" in said
     assert not read(path, body=body).betas.any()
 
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from xavatar_jax.body import SMPLX_TREE, pose_body
-from xavatar_jax.motion import Motion, load_motion, rest_pelvis, save_amass
-from xavatar_jax.motion.convert import MotionNotice
+from xavatar_jax.motion import Motion, MotionNotice, load_motion, rest_pelvis, save_amass
 
 NAMES = SMPLX_TREE.names
 

@@ -12,16 +12,17 @@ import pytest
 import trimesh
 from helpers import PARENTS, TREES
 
-from xavatar_jax.body import BodyParams
+from xavatar_jax.body import BodyParams, Part, Parts
 from xavatar_jax.frames import Frame
 from xavatar_jax.sampling import (
     SamplingPlan,
     bone_points,
     joint_targets,
     pose_distance,
-    sample_frame,
     signed_distance,
+    surface_points,
     varied_frames,
+    volume_points,
 )
 
 
@@ -116,7 +117,8 @@ def frame():
     face = labels == 1
     labels[face & (vertices[:, 2] > 0.05)] = 4
     params = BodyParams(jnp.zeros((1, 3)), jnp.zeros(1), jnp.zeros(0), jnp.zeros(3), TREES["mano"])
-    return Frame(vertices.astype(np.float32), faces.astype(np.int32), params, None, "toy"), labels
+    toy = Frame(vertices.astype(np.float32), faces.astype(np.int32), params, None, "toy")
+    return toy, Parts(labels.astype(np.int8))
 
 
 PLAN = SamplingPlan(
@@ -128,28 +130,28 @@ PLAN = SamplingPlan(
 def test_counts_by_part_and_places(frame, by_vertex):
     plan = replace(PLAN, by_vertex=by_vertex)
     assert plan.total == 200 + 80 + 40 + 2 * 60 + 50
-    found = sample_frame(*frame, plan, np.random.default_rng(0))
-    assert found.points.shape == (plan.total, 3)
-    assert found.points.dtype == np.float32
-    counts = np.bincount(found.parts, minlength=5)
+    found = volume_points(*frame, plan, np.random.default_rng(0))
+    assert found.x_d.shape == (plan.total, 3)
+    assert found.x_d.dtype == np.float32
+    counts = np.bincount(found.part, minlength=5)
     np.testing.assert_array_equal(counts, [250, 80, 60, 60, 40])
     for part, centre, radius in ((2, (0.6, 0, 0), 0.05), (3, (-0.6, 0, 0), 0.05)):
-        away = np.linalg.norm(found.points[found.parts == part] - centre, axis=1)
+        away = np.linalg.norm(found.x_d[found.part == part] - centre, axis=1)
         np.testing.assert_allclose(away, radius, atol=3e-3)
-        assert np.abs(found.distance[found.parts == part]).max() < 1e-5
+        assert np.abs(found.distance[found.part == part]).max() < 1e-5
     low, high = frame[0].vertices.min(0) - 0.1, frame[0].vertices.max(0) + 0.1
-    box = found.points[-50:]
+    box = found.x_d[-50:]
     assert ((box >= low) & (box <= high)).all()
     assert np.ptp(box, axis=0).min() > 0.5 * (high - low).min()
 
 
 def test_every_vertex_of_a_part_has_the_same_odds(frame):
     plan = replace(PLAN, body=0, face=0, eyes_mouth=0, hand=16_200, box=0)
-    found = sample_frame(*frame, plan, np.random.default_rng(3))
-    toy, labels = frame
+    found = volume_points(*frame, plan, np.random.default_rng(3))
+    toy, parts = frame
     for part in (2, 3):
-        own = toy.vertices[labels == part]
-        drawn = found.points[found.parts == part]
+        own = toy.vertices[parts.labels == part]
+        drawn = found.x_d[found.part == part]
         apart = np.abs(drawn[:, None] - own).max(2)
         assert apart.min(1).max() < 1e-6
         times = np.bincount(apart.argmin(1), minlength=len(own))
@@ -162,38 +164,87 @@ def test_noise_has_the_sizes_given(frame):
     plan = SamplingPlan(
         body=4000, face=0, eyes_mouth=0, hand=0, sigma=(0.002, 0.03), by_vertex=False
     )
-    found = sample_frame(*frame, plan, np.random.default_rng(1))
-    off = np.abs(np.linalg.norm(found.points, axis=1) - 0.3)
+    found = volume_points(*frame, plan, np.random.default_rng(1))
+    off = np.abs(np.linalg.norm(found.x_d, axis=1) - 0.3)
     # Along the normal of a sphere the offset is a normal deviate: mean size 0.8 sigma.
     np.testing.assert_allclose(off[::2].mean(), 0.8 * 0.002, atol=1e-3)
     np.testing.assert_allclose(off[1::2].mean(), 0.8 * 0.03, rtol=0.1)
-    expected = 0.3 - np.linalg.norm(found.points, axis=1)
-    alone = np.abs(found.points).max(1) < 0.32  # nearer to this sphere than to the others
+    expected = 0.3 - np.linalg.norm(found.x_d, axis=1)
+    alone = np.abs(found.x_d).max(1) < 0.32  # nearer to this sphere than to the others
     np.testing.assert_allclose(found.distance[alone], expected[alone], atol=4e-3)
 
 
 def test_the_whole_surface_without_parts(frame):
     plan = replace(PLAN, uniform=True, by_vertex=False, box=0)
-    found = sample_frame(*frame, plan, np.random.default_rng(2))
-    assert len(found.points) == plan.total
+    found = volume_points(*frame, plan, np.random.default_rng(2))
+    assert len(found.x_d) == plan.total
     areas = np.array([0.3, 0.1, 0.05, 0.05]) ** 2
-    share = np.bincount(np.where(found.parts == 4, 1, found.parts), minlength=4) / plan.total
+    share = np.bincount(np.where(found.part == 4, 1, found.part), minlength=4) / plan.total
     np.testing.assert_allclose(share, areas / areas.sum(), atol=0.05)
 
 
 def test_a_missing_part_gives_its_points_to_the_body(frame):
-    toy, labels = frame
-    found = sample_frame(toy, np.where(labels == 2, 0, labels), PLAN, np.random.default_rng(0))
-    counts = np.bincount(found.parts, minlength=5)
+    toy, parts = frame
+    without = parts.with_labels(np.where(parts.labels == 2, 0, parts.labels))
+    found = volume_points(toy, without, PLAN, np.random.default_rng(0))
+    counts = np.bincount(found.part, minlength=5)
     np.testing.assert_array_equal(counts, [310, 80, 0, 60, 40])
 
 
 def test_seeds(frame):
     plan = replace(PLAN, sigma=(0.01,))
-    a, b, c = (sample_frame(*frame, plan, np.random.default_rng(s)) for s in (5, 5, 6))
+    a, b, c = (volume_points(*frame, plan, np.random.default_rng(s)) for s in (5, 5, 6))
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x, y)
-    assert not np.array_equal(a.points, c.points)
+    assert not np.array_equal(a.x_d, c.x_d)
+
+
+def test_parts_of_a_body_decide_what_is_drawn(frame):
+    """Two hands that are one part of their own, sampled as a hand and with the fine noise."""
+    toy, parts = frame
+    table = (Part("body"), Part("claw", region="hands", sampled_as="hand"))
+    claws = Parts(np.isin(parts.labels, (2, 3)).astype(np.int8), table)
+    plan = replace(PLAN, sigma=(0.1,), box=0)
+    found = volume_points(toy, claws, plan, np.random.default_rng(0))
+    np.testing.assert_array_equal(np.bincount(found.part), [200, 60])
+    assert np.abs(found.distance[found.part == 1]).max() < 1e-5
+    assert np.abs(found.distance[found.part == 0]).mean() > 0.02
+
+
+def test_surface_points_of_a_sphere(rng):
+    """Positions, normals and colours against the sphere's; weights sum to areas."""
+    vertices, faces = sphere(0.3)
+    labels = np.where(vertices[:, 2] > 0, 1, 0)
+    parts = Parts(labels.astype(np.int8))
+    ramp = np.repeat(((vertices[:, :1] + 0.3) / 0.6), 3, axis=1)
+    shades = np.concatenate([np.rint(255 * ramp), np.zeros((len(vertices), 1))], 1)
+    for densities in (None, parts.densities):
+        found = surface_points(
+            vertices, faces, parts, 20_000, rng, colors=shades.astype(np.uint8),
+            densities=densities,
+        )  # fmt: skip
+        out = found.x_d / np.linalg.norm(found.x_d, axis=1, keepdims=True)
+        np.testing.assert_allclose(np.linalg.norm(found.x_d, axis=1), 0.3, atol=1e-3)
+        np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1, atol=1e-5)
+        assert (found.normal * out).sum(1).min() > 0.99
+        np.testing.assert_allclose(found.color[:, 0], (found.x_d[:, 0] + 0.3) / 0.6, atol=3e-3)
+        assert found.color.shape == (20_000, 3)
+        far = np.abs(found.x_d[:, 2]) > 0.05
+        np.testing.assert_array_equal(found.part[far], (found.x_d[:, 2] > 0)[far])
+        area = 4 * np.pi * 0.3**2
+        np.testing.assert_allclose(found.weight.sum(), area, rtol=0.03)
+        np.testing.assert_allclose(found.weight[found.part == 1].sum(), area / 2, rtol=0.05)
+        share = (found.part == 1).mean()
+        np.testing.assert_allclose(share, 0.5 if densities is None else 5 / 6, atol=0.03)
+    plain = surface_points(vertices, faces, parts, 10, rng)
+    assert plain.color is None
+    assert {leaf.dtype for leaf in (plain.x_d, plain.normal, plain.weight)} == {
+        np.dtype(np.float32)
+    }
+    with pytest.raises(ValueError, match="3 colors for"):
+        surface_points(vertices, faces, parts, 10, rng, colors=np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="without area"):
+        surface_points(np.zeros((3, 3)), np.array([[0, 1, 2]]), Parts(np.zeros(3, np.int8)), 5, rng)
 
 
 def test_varied_frames_pick_the_odd_ones_out(rng):

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 from small_runs import posed_frames, tiny
-
-import xavatar_jax as xa
 from xavatar_jax.training import fresh_fields, loop, step
 from xavatar_jax.training.pool import find_roots, label_frames
 from xavatar_jax.training.progress import progress
+
+import xavatar_jax as xa
 
 
 @pytest.fixture(scope="session")

@@ -8,13 +8,6 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-
-import xavatar_jax as xa
-from xavatar_jax.body import BODY, HANDS, canonical_vertices
-from xavatar_jax.fields import MLPShape, hierarchical_softmax, num_logits
-from xavatar_jax.frames import frames_from_params
-from xavatar_jax.geometry import face_areas
-from xavatar_jax.sampling import SamplingPlan, sample_frame
 from xavatar_jax.training import (
     ABLATIONS,
     PRESETS,
@@ -24,6 +17,13 @@ from xavatar_jax.training import (
     prefit,
     settle_on_person,
 )
+
+import xavatar_jax as xa
+from xavatar_jax.body import canonical_vertices
+from xavatar_jax.fields import MLPShape, hierarchical_softmax, num_logits
+from xavatar_jax.frames import frames_from_params
+from xavatar_jax.geometry import face_areas
+from xavatar_jax.sampling import SamplingPlan, volume_points
 
 
 def leaves(values, path=()):
@@ -61,20 +61,20 @@ def test_uniform_sampling_is_by_area_and_keeps_parts_and_noise():
         SamplingPlan(sigma=(0.01,), fine_sigma=(0.0,), by_vertex=False, uniform=True),
         body=2000, face=400, eyes_mouth=0, hand=300, box=100,
     )  # fmt: skip
-    drawn = sample_frame(frame, labels, plan, np.random.default_rng(0))
-    assert len(drawn.points) == plan.total
+    drawn = volume_points(frame, body.parts.with_labels(labels), plan, np.random.default_rng(0))
+    assert len(drawn.x_d) == plan.total
     faces = np.asarray(frame.faces)
     areas = face_areas(np.asarray(frame.vertices, float), faces)
     surface = slice(0, plan.total - plan.box)
-    for parts in ((BODY,), HANDS):
+    for parts in ((0,), (2, 3)):
         share = areas[np.isin(labels[faces[:, 0]], parts)].sum() / areas.sum()
-        found = np.isin(drawn.parts[surface], parts).mean()
+        found = np.isin(drawn.part[surface], parts).mean()
         # Three standard deviations of a share of three thousand draws.
         assert abs(found - share) < 3 * np.sqrt(share * (1 - share) / 3000)
-    hands = np.isin(drawn.parts[surface], HANDS)
+    hands = np.isin(drawn.part[surface], (2, 3))
     # Points of the hands have the noise of the hands, which is none here.
     assert np.abs(drawn.distance[surface][hands]).max() < 1e-6
-    assert np.median(np.abs(drawn.distance[surface][drawn.parts[surface] == BODY])) > 0.003
+    assert np.median(np.abs(drawn.distance[surface][drawn.part[surface] == 0])) > 0.003
 
 
 @pytest.mark.parametrize("kind", ["grid", "mlp"])

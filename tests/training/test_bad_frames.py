@@ -11,13 +11,13 @@ import jax
 import numpy as np
 import pytest
 from small_runs import posed_frames, tiny
-
-import xavatar_jax as xa
-from xavatar_jax.geometry import winding_number
 from xavatar_jax.training import TrainingNotice, choose_frames, loop
 from xavatar_jax.training.check import FrameCheck, check_expression, check_found
 from xavatar_jax.training.pool import label_frames
 from xavatar_jax.training.progress import progress
+
+import xavatar_jax as xa
+from xavatar_jax.geometry import winding_number
 
 ASIDE = np.array([2.0, 0.0, 0.0])
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from xavatar_jax.training.devices import ONE_DEVICE, share_work
 
 import xavatar_jax as xa
 from xavatar_jax.files import save_arrays
-from xavatar_jax.training.devices import ONE_DEVICE, share_work
 
 RUN = """
 import json, sys

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-
 from xavatar_jax.training.config import has_guide
 from xavatar_jax.training.loop import train_pool
 from xavatar_jax.training.model import trainable_filter

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import SMPLX_PARENTS
+from xavatar_jax.training import AvatarFields, objective
+from xavatar_jax.training.batch import Batch
+from xavatar_jax.training.step import make_optimiser, rate_factor
 
 import xavatar_jax as xa
 from xavatar_jax.body import bone_transforms
 from xavatar_jax.correspondence import start_table
 from xavatar_jax.fields import MLPGeometry, MLPShape, MLPSkinning
-from xavatar_jax.training import AvatarFields, objective
-from xavatar_jax.training.batch import Batch
-from xavatar_jax.training.step import make_optimiser, rate_factor
 
 # Bones that start the search, by part label: body, face, left hand, right hand, eyes and mouth.
 FACE = (12, 15, 22)

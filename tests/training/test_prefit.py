@@ -10,9 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_runs import tiny
-
-import xavatar_jax as xa
-from xavatar_jax.body import HANDS, canonical_vertices, load_body
 from xavatar_jax.training import (
     TrainingNotice,
     fresh_fields,
@@ -20,6 +17,9 @@ from xavatar_jax.training import (
     prefit,
     settle_on_person,
 )
+
+import xavatar_jax as xa
+from xavatar_jax.body import canonical_vertices, load_body
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +69,7 @@ def test_a_network_is_fitted_to_the_template_whether_or_not_it_is_learned(
 
 def test_detail_reaches_around_the_persons_own_hands(toy_body, config):
     """However far they lie from the mean shape's: fields are the same whether settled or made."""
-    hands = np.isin(np.asarray(toy_body.part_labels), HANDS)
+    hands = toy_body.parts.mask("hands")
 
     def hands_of(betas):
         return canonical_vertices(toy_body, jnp.asarray(betas, jnp.float32))[hands]

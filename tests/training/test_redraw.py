@@ -10,11 +10,11 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from xavatar_jax.training import Interrupted, loop, redraw
+from xavatar_jax.training.redraw import Redraw, put_rows
 
 import xavatar_jax as xa
 from xavatar_jax.geometry import winding_number
-from xavatar_jax.training import Interrupted, loop, redraw
-from xavatar_jax.training.redraw import Redraw, put_rows
 
 
 @pytest.fixture(scope="module")

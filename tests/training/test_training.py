@@ -10,9 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_runs import tiny
-
-import xavatar_jax as xa
-from xavatar_jax.fields import MLPShape
 from xavatar_jax.training import (
     PRESETS,
     TrainingError,
@@ -36,6 +33,9 @@ from xavatar_jax.training.pool import (
 )
 from xavatar_jax.training.progress import progress
 from xavatar_jax.training.step import batch_of, draw_batch
+
+import xavatar_jax as xa
+from xavatar_jax.fields import MLPShape
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_runs import posed_frames
-
-import xavatar_jax as xa
-from xavatar_jax.frames import frames_from_params
 from xavatar_jax.training import ValidationConfig, choose_frames
 from xavatar_jax.training.loop import train_pool
 from xavatar_jax.training.validation import Best, split_validation
+
+import xavatar_jax as xa
+from xavatar_jax.frames import frames_from_params
 
 
 def sequences(lengths, body):
@@ -133,7 +133,7 @@ def test_validation_is_the_loss_of_the_fields_at_their_roots(case, judged):
     found, several = int(pool.found[2]), int(pool.several[2])
     condition = fields.geometry.condition(jax.tree.map(lambda leaf: leaf[2], pool.params))
     roots = pool.root[2, several:found]
-    logit = np.asarray(jax.vmap(lambda x: fields.geometry(x, condition))(roots), np.float64)
+    logit = np.asarray(jax.vmap(lambda x: fields.geometry(x, condition).level)(roots), np.float64)
     scaled = np.asarray(pool.distance[2, several:found], np.float64) / config.losses.softness
 
     def entropy(z, t):

@@ -121,7 +121,7 @@ class Page:
 def open_browser() -> Iterator[Page]:
     """A page of a fresh browser, closed at the end."""
     connect = pytest.importorskip(
-        "websockets.sync.client", reason="no websockets: pip install 'xavatar-jax[view]'"
+        "websockets.sync.client", reason="no websockets: pip install -e '.[view]'"
     ).connect
     program = chromium()
     folder = tempfile.mkdtemp(prefix="chromium-")

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from xavatar_jax.training import prefit
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import CellSizes
 from xavatar_jax.fields import GridSpacing
-from xavatar_jax.training import prefit
 
 
 @pytest.fixture(scope="session")

@@ -163,7 +163,7 @@ def test_notebooks_show_the_page_in_place(avatar):
 
 
 def test_bad_paths_are_refused_and_leave_nothing(avatar, motion, tmp_path):
-    with pytest.raises(ValueError, match=r"avatar\.glb: a page is written"):
+    with pytest.raises(ValueError, match=r"avatar\.glb: the page is HTML"):
         view_html(tmp_path / "avatar.glb", avatar, motion)
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):

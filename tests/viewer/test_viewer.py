@@ -14,8 +14,17 @@ import xavatar_jax as xa
 from viewer.browser import open_browser
 from xavatar_jax.body import facing
 from xavatar_jax.frames import frames_from_params
-from xavatar_jax.viewer.poses import frame_of, joint_choices, turned
-from xavatar_jax.viewer.surfaces import ERROR, NORMALS, TRUTH, WEIGHTS, Surfaces, Wish
+from xavatar_jax.viewer.surfaces import (
+    ERROR,
+    NORMALS,
+    TRUTH,
+    WEIGHTS,
+    Request,
+    Surfaces,
+    frame_of,
+    joint_choices,
+    turned,
+)
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +34,12 @@ def frames(avatar, motion):
 
 @pytest.fixture(scope="module")
 def surfaces(avatar, motion, frames):
-    return Surfaces(avatar, motion.to_params(avatar.body), frames, np.array([0, 1, 0]), 5.0)
+    return Surfaces(avatar, motion.to_params(avatar.body), frames, np.array([0.0, 1.0, 0.0]), 5.0)
 
 
 @pytest.fixture(scope="module")
 def viewer(avatar, motion, frames):
-    pytest.importorskip("viser", reason="no viser: pip install 'xavatar-jax[view]'")
+    pytest.importorskip("viser", reason="no viser: pip install -e '.[view]'")
     with xa.view(avatar, motion, frames, port=8470, verbose=False) as opened:
         opened.wait_until_shown(120)
         yield opened
@@ -61,9 +70,9 @@ def test_facing_follows_the_root(avatar):
 
 def test_surface_of_a_frame_is_that_of_the_animation(avatar, motion, surfaces):
     expected = avatar.animate(motion).frame_vertices(4)
-    shown = surfaces(Wish(frame=4))
+    shown = surfaces(Request(frame=4))
     np.testing.assert_allclose(shown.vertices, expected, atol=1e-5)
-    stays = surfaces(Wish(frame=4, in_place=True))
+    stays = surfaces(Request(frame=4, in_place=True))
     np.testing.assert_allclose(
         stays.vertices, expected - motion.transl[4] + motion.transl[0], atol=1e-5
     )
@@ -71,8 +80,8 @@ def test_surface_of_a_frame_is_that_of_the_animation(avatar, motion, surfaces):
 
 def test_a_turned_elbow_moves_that_forearm_alone(surfaces):
     names = surfaces.avatar.body.tree.names
-    rest = surfaces(Wish()).vertices
-    bent = surfaces(Wish(turns=((names.index("left_elbow"), (0.0, 1.0, 0.0)),))).vertices
+    rest = surfaces(Request()).vertices
+    bent = surfaces(Request(turns=((names.index("left_elbow"), (0.0, 1.0, 0.0)),))).vertices
     moved = np.linalg.norm(bent - rest, axis=1) > 0.01
     # In the rest pose the person's left arm points along +x.
     assert moved.any()
@@ -82,17 +91,17 @@ def test_a_turned_elbow_moves_that_forearm_alone(surfaces):
 
 def test_colours_say_weights_normals_and_distance(surfaces):
     arm = surfaces.avatar.body.tree.names.index("left_elbow")
-    colors = surfaces(Wish(shading=WEIGHTS, bone=arm)).colors.astype(int)
-    rest = surfaces(Wish()).vertices
+    colors = surfaces(Request(shading=WEIGHTS, bone=arm)).colors.astype(int)
+    rest = surfaces(Request()).vertices
     assert np.ptp(colors[rest[:, 0] < 0], axis=0).max() < 10
     assert (colors[rest[:, 0] > 0][:, 0] - colors[rest[:, 0] > 0][:, 2]).max() > 120
-    assert surfaces(Wish(shading=NORMALS)).colors.shape == rest.shape
-    wrong = surfaces(Wish(frame=2, shading=ERROR))
+    assert surfaces(Request(shading=NORMALS)).colors.shape == rest.shape
+    wrong = surfaces(Request(frame=2, shading=ERROR))
     distance = float(wrong.note.split(" mm")[0].split()[-1])
     vertices, truth = wrong.vertices, surfaces.frames[2].vertices
     nearest = np.linalg.norm(vertices[::50, None] - truth[None], axis=2).min(1)
     assert 0 < distance < 1000 * nearest.mean() * 1.3
-    shown = surfaces(Wish(frame=2, shading=TRUTH))
+    shown = surfaces(Request(frame=2, shading=TRUTH))
     np.testing.assert_array_equal(shown.vertices, truth)
 
 
@@ -140,9 +149,9 @@ def test_player_loops_over_the_frames(viewer):
 
 def test_panel_asks_for_what_its_sliders_say(viewer):
     viewer.panel.set_turn(16, (0.0, 0.0, 30.0))
-    assert viewer.panel.wish().turns == ((16, (0.0, 0.0, pytest.approx(np.pi / 6))),)
+    assert viewer.panel.request().turns == ((16, (0.0, 0.0, pytest.approx(np.pi / 6))),)
     viewer.panel.reset()
-    assert viewer.panel.wish().turns == ()
+    assert viewer.panel.request().turns == ()
 
 
 def test_viewer_answers_this_machine_and_notebooks_show_it(viewer):
@@ -152,12 +161,12 @@ def test_viewer_answers_this_machine_and_notebooks_show_it(viewer):
 
 
 def test_frames_must_fit_the_motion(avatar, motion, frames):
-    pytest.importorskip("viser", reason="no viser: pip install 'xavatar-jax[view]'")
+    pytest.importorskip("viser", reason="no viser: pip install -e '.[view]'")
     with pytest.raises(ValueError, match="5 frames of ground truth for a motion of 7"):
         xa.view(avatar, motion, frames[:5], verbose=False)
 
 
 def test_without_viser_the_extra_is_named(avatar, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ImportError, match=r"xavatar-jax\[view\]"):
+    with pytest.raises(ImportError, match=r'pip install -e "\.\[view\]"'):
         xa.view(avatar)

@@ -1,16 +1,36 @@
-"""Avatars: fit, query, pose, evaluate, save and load."""
+"""Avatars of any method: query, pose, animate, export, evaluate, save and load."""
 
+from .animate import DEFAULT_FPS as DEFAULT_FPS
 from .animate import Animation as Animation
 from .animate import AnimationAccuracy as AnimationAccuracy
-from .avatar import Avatar as Avatar
+from .animate import MotionLike as MotionLike
+from .animate import animate as animate
+from .animate import posed_frame as posed_frame
+from .animate import spread_frames as spread_frames
+from .body_only import BodyOnlyAvatar as BodyOnlyAvatar
+from .body_only import body_only as body_only
+from .body_only import body_only_frames as body_only_frames
+from .body_only import body_only_params as body_only_params
+from .body_only import kept_joints as kept_joints
 from .evaluate import Evaluation as Evaluation
-from .evaluate import Posable as Posable
 from .evaluate import evaluate as evaluate
-from .fit import Fit as Fit
-from .fit import fit as fit
-from .query import Query as Query
+from .files import AvatarHeader as AvatarHeader
+from .files import load_avatar_body as load_avatar_body
+from .files import load_avatar_header as load_avatar_header
+from .files import needs_bundled_body as needs_bundled_body
+from .implicit import Avatar as Avatar
+from .implicit import CellSizes as CellSizes
+from .load import load_avatar as load_avatar
+from .protocol import AbstractRestSurface as AbstractRestSurface
+from .protocol import Drivable as Drivable
+from .queries import PosedField as PosedField
+from .queries import Query as Query
+from .queries import SearchSpec as SearchSpec
+from .queries import occupancy as occupancy
+from .queries import query as query
 from .rigging import GlbExport as GlbExport
-from .store import load_avatar as load_avatar
-from .store import load_avatar_body as load_avatar_body
-from .store import load_avatar_config as load_avatar_config
-from .surface import CellSizes as CellSizes
+from .rigging import build_clip as build_clip
+from .rigging import build_rig as build_rig
+from .rigging import export_glb as export_glb
+from .rigging import export_weights as export_weights
+from .rigging import expression_scales as expression_scales

@@ -1,47 +1,38 @@
-"""An avatar over many frames: one base mesh, moved and skinned at the cost of milliseconds."""
+"""A drivable avatar over many frames: one rest surface, moved and skinned in milliseconds."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from ..body import (
-    BodyModel,
-    BodyParams,
-    bone_transforms,
-    canonical_params,
-    check_params,
-    with_betas,
-)
+from ..body import BodyModel, BodyParams, bone_transforms, check_params, with_betas
 from ..export import SequenceFormat, write_sequence
-from ..fields import AbstractFixedPoints
 from ..geometry import closest_points
+from ..learning import progress
 from ..meshing import Mesh
-from ..training import AvatarFields
-from ..training.progress import progress
-from .pointwise import PROJECT_STEP, PROJECT_STEPS, batch_size, gradients, in_batches, skin_weights
-
-if TYPE_CHECKING:
-    from .avatar import Avatar
+from .protocol import AbstractRestSurface, Drivable, Mode
 
 Offsets = Literal["cached", "exact", "none"]
 DEFAULT_FPS = 30.0
-_LARGEST_STEP = PROJECT_STEPS * PROJECT_STEP  # as far as the exact way goes
+"""Frame rate of parameters, which have none of their own."""
 _FRAME_BLOCK = 64
 
 
 @runtime_checkable
 class MotionLike(Protocol):
-    """What is asked of a motion: see `xa.Motion`."""
+    """The part of `xa.Motion` that animations use.
+
+    `fps`; the `up` axis; the `source`, for messages; and `to_params(body)`, the parameters.
+    """
 
     @property
     def fps(self) -> float: ...
@@ -52,27 +43,11 @@ class MotionLike(Protocol):
     def to_params(self, body: BodyModel) -> BodyParams: ...
 
 
-class NeutralSurface(eqx.Module):
-    """The neutral surface, and what of it is the same in every frame. Vertices are columns.
-
-    - `vertices`: metres, canonical space; `normals`: unit gradients of the field, inwards.
-    - `slopes`: length of the gradient, logits a metre.
-    - `weights`: skinning weights at the vertices.
-    - `logits`: the geometry field at the vertices.
-    """
-
-    vertices: Float[Array, "3 V"]
-    normals: Float[Array, "3 V"]
-    slopes: Float[Array, " V"]
-    weights: Float[Array, "J V"]
-    logits: AbstractFixedPoints
-
-
 class Drive(NamedTuple):
-    """What T frames do to the fields: conditions, and bone transforms `(T, J, 4, 4)`."""
+    """T frames as a rest surface takes them: conditions, and bone transforms."""
 
-    conditions: Any
-    transforms: Float[Array, "T J 4 4"]
+    conditions: PyTree[Array]
+    transforms: Float[Array | np.ndarray, "*T J 4 4"]
 
 
 class Spread(NamedTuple):
@@ -90,10 +65,10 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class AnimationAccuracy:
-    """How far animated frames lie from those that `Avatar.mesh` gives, millimetres.
+    """How far animated frames are from the avatar's own surfaces, millimetres.
 
-    - `vertex`: between vertices of the same number, sliding along the surface included.
-    - `surface`: from an animated vertex to the closest point of the other surface.
+    - `vertex`: between vertices with the same index, including motion along the surface.
+    - `surface`: from an animated vertex to the closest point of the avatar's surface.
     - `frames`: how many frames were compared.
     """
 
@@ -104,19 +79,19 @@ class AnimationAccuracy:
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """Posed surfaces of an avatar, frame by frame, computed when they are asked for.
+    """Posed surfaces of an avatar, frame by frame, computed when they are needed.
 
-    `animation[k]` is the mesh of a frame, iteration gives the meshes of all. In fast mode all
-    frames share their faces; `chunks` and `vertices` give bare positions.
+    `animation[k]` is the mesh of a frame; iteration gives all meshes. In fast mode all frames
+    have the same faces, and `chunks` and `vertices` give positions only.
 
-    - `params`: of the T frames, with the avatar's own shape.
-    - `fps`: frames a second, for files that keep time.
+    - `params`: parameters of the T frames, with the avatar's shape.
+    - `fps`: frames per second, for files that keep time.
     """
 
-    avatar: Avatar
+    avatar: Drivable
     params: BodyParams
     fps: float = DEFAULT_FPS
-    mode: Literal["fast", "full"] = "fast"
+    mode: Mode = "fast"
     offsets: Offsets = "cached"
     source: str = "animation"
 
@@ -128,10 +103,8 @@ class Animation:
             raise IndexError(f"frame {index} of {len(self)}")
         index = index % len(self)
         if self.mode == "full":
-            return self.avatar.mesh(self.params[index], mode="full")
-        return replace(
-            self.avatar.canonical_mesh(), vertices=self.frame_vertices(index), normals=None
-        )
+            return self.avatar.surface(self.params[index], mode="full")
+        return Mesh(self.frame_vertices(index), self.faces, colors=self._rest.colors)
 
     def __iter__(self) -> Iterator[Mesh]:
         return (self[k] for k in range(len(self)))
@@ -140,7 +113,7 @@ class Animation:
     def faces(self) -> Int[np.ndarray, "F 3"]:
         """Faces of every frame. **Raises:** `ValueError` in full mode, where each has its own."""
         self._same_faces()
-        return self.avatar.canonical_mesh().faces
+        return self._rest.faces
 
     def chunks(self, size: int = 16) -> Iterator[Float[np.ndarray, "n V 3"]]:
         """Posed vertices of `size` frames at a time, metres, float32; the last may be fewer.
@@ -161,7 +134,7 @@ class Animation:
         **Raises:** `ValueError` in full mode.
         """
         self._same_faces()
-        out = np.empty((len(self), self.avatar.canonical_mesh().num_vertices, 3), np.float32)
+        out = np.empty((len(self), self._rest.vertices.shape[1], 3), np.float32)
         with progress("animation", len(self), verbose=verbose, unit="frame") as bar:
             for k in range(len(self)):
                 out[k] = self.frame_vertices(k)
@@ -169,7 +142,7 @@ class Animation:
         return out
 
     def error(self, num_frames: int = 8, *, verbose: bool = False) -> AnimationAccuracy:
-        """Compare `num_frames`, evenly spread, with the frames' own meshes.
+        """Compare `num_frames`, evenly spread, with `avatar.surface`.
 
         **Raises:** `ValueError` in full mode.
         """
@@ -178,7 +151,7 @@ class Animation:
         between, away = [], []
         with progress("comparison", len(chosen), verbose=verbose, unit="frame") as bar:
             for k in chosen:
-                fast, own = self.frame_vertices(int(k)), self.avatar.mesh(self.params[int(k)])
+                fast, own = self.frame_vertices(int(k)), self.avatar.surface(self.params[int(k)])
                 between.append(np.linalg.norm(fast - own.vertices, axis=1))
                 away.append(closest_points(own.vertices, own.faces, fast)[0])
                 bar.update(1)
@@ -210,33 +183,45 @@ class Animation:
         """Posed vertices of one frame, metres, float32. **Raises:** `ValueError` in full mode."""
         self._same_faces()
         if self.offsets == "exact":
-            return self.avatar.mesh(self.params[index]).vertices
-        drive = self.drive
-        condition, transforms = jax.tree.map(lambda leaf: leaf[index], drive)
-        posed = posed_vertices(
-            self.avatar.neutral_surface, condition, transforms, self.offsets == "cached"
-        )
-        return np.asarray(posed)
+            return self.avatar.surface(self.params[index]).vertices
+        drive = jax.tree.map(lambda leaf: leaf[index], self.drive)
+        return np.asarray(posed_vertices(self._rest, drive, self.offsets == "cached"))
 
     @cached_property
     def drive(self) -> Drive:
         """Conditions and bone transforms of all frames, made on first use."""
-        return drive_frames(self.avatar.fields, self.avatar.body, self.params)
+        return drive_frames(self._rest, self.avatar.body, self.params)
+
+    @property
+    def _rest(self) -> AbstractRestSurface:
+        return self.avatar.rest
 
     def _same_faces(self) -> None:
         if self.mode == "full":
-            raise ValueError("in full mode every frame has faces of its own: iterate over meshes")
+            raise ValueError("in full mode every frame has its own faces: iterate over the meshes")
 
 
 def animate(
-    avatar: Avatar,
+    avatar: Drivable,
     motion: MotionLike | BodyParams,
     *,
-    mode: Literal["fast", "full"] = "fast",
+    mode: Mode = "fast",
     offsets: Offsets = "cached",
     fps: float | None = None,
 ) -> Animation:
-    """See `Avatar.animate`."""
+    """The posed surface over a motion, or over parameters `(T, ...)`. Nothing is computed yet.
+
+    `fast` moves and skins one rest surface, so all frames have the same faces. `offsets` decides
+    how its vertices follow pose and expression: `cached` takes one step along the normals, in
+    milliseconds; `exact` calls `avatar.surface` for each frame; `none` only skins.
+    `Animation.error` measures the difference. `full` makes each frame's most accurate surface.
+
+    The motion's world is kept (`Motion.to_y_up` turns it); its shape is replaced by the avatar's.
+    `fps` replaces the motion's frame rate; parameters have none and get 30.
+
+    **Raises:** `ValueError` for parameters that do not fit the body or are not finite, or a frame
+    rate that is not positive; `TypeError` for anything but a motion or parameters.
+    """
     for name, value, known in (
         ("mode", mode, ("fast", "full")),
         ("offsets", offsets, ("cached", "exact", "none")),
@@ -258,8 +243,8 @@ def animate(
     return Animation(avatar, params, float(rate), mode, offsets, source)
 
 
-def own_batch(avatar: Avatar, params: BodyParams, source: str) -> BodyParams:
-    """Checked parameters with one batch axis and the avatar's shape in place of theirs."""
+def own_batch(avatar: Drivable, params: BodyParams, source: str) -> BodyParams:
+    """Checked parameters with one batch axis and the avatar's shape."""
     if params.pose.ndim == 2:
         params = jax.tree.map(lambda leaf: leaf[None], params)
     if params.pose.ndim != 3 or len(params) == 0:
@@ -272,51 +257,17 @@ def own_batch(avatar: Avatar, params: BodyParams, source: str) -> BodyParams:
 
 
 def spread_frames(count: int, wanted: int) -> Int[np.ndarray, " n"]:
-    """At most `wanted` frame numbers of `count`, evenly spread, first and last among them."""
+    """At most `wanted` of `count` frame numbers, evenly spread, with the first and the last."""
     if wanted < 1:
         raise ValueError(f"{wanted} frames; at least one is needed")
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
 
 
-def neutral_surface(avatar: Avatar) -> NeutralSurface:
-    """What `animate` keeps of an avatar: the neutral surface, its gradients and weights."""
-    neutral = canonical_params(avatar.body, jnp.asarray(avatar.betas))
-    # Vertices of the extracted surface lie on its cells' planes: here on the level set itself.
-    points = avatar.canonical_mesh(neutral).vertices
-    fields, batch = avatar.fields, batch_size(avatar.config)
-    condition = fields.geometry.condition(neutral)
-    gradient = in_batches(lambda x: gradients(fields, x, condition), points, batch)
-    slopes = np.maximum(np.linalg.norm(gradient, axis=1), 1e-6)
-    return NeutralSurface(
-        vertices=jnp.asarray(points.T),
-        normals=jnp.asarray((gradient / slopes[:, None]).T),
-        slopes=jnp.asarray(slopes),
-        weights=jnp.asarray(in_batches(lambda x: skin_weights(fields, x), points, batch).T),
-        logits=_at(fields, jnp.asarray(points)),
-    )
-
-
-_at = eqx.filter_jit(lambda fields, points: fields.geometry.at(points))
-
-
 @eqx.filter_jit
-def offset_vertices(base: NeutralSurface, condition: Any) -> Float[Array, "3 V"]:
-    """The base on the surface of one condition, to first order: a step along its own normal.
-
-    From where the condition carries it.
-    """
-    away = base.logits(condition) / base.slopes
-    carried = base.logits.carried(condition).T
-    return carried - base.normals * jnp.clip(away, -_LARGEST_STEP, _LARGEST_STEP)
-
-
-@eqx.filter_jit
-def posed_vertices(
-    base: NeutralSurface, condition: Any, transforms: Float[Array, "J 4 4"], offset: bool
-) -> Float[Array, "V 3"]:
-    """Vertices of one frame, metres: offset by the frame's condition if asked, then skinned."""
-    points = offset_vertices(base, condition) if offset else base.vertices
-    return skin_columns(points, base.weights, transforms)
+def posed_vertices(rest: AbstractRestSurface, drive: Drive, offset: bool) -> Float[Array, "V 3"]:
+    """Vertices of one frame, metres: moved by the frame's condition if asked, then skinned."""
+    points = rest.under(drive.conditions) if offset else rest.vertices
+    return skin_columns(points, rest.weights, jnp.asarray(drive.transforms))
 
 
 @eqx.filter_jit
@@ -331,38 +282,33 @@ def skin_columns(
     return (m[:, 0] * x + m[:, 1] * y + m[:, 2] * z + m[:, 3]).T
 
 
-def posed_frame(avatar: Avatar, params: BodyParams) -> Float[np.ndarray, "V 3"]:
-    """Vertices of one frame in `Animation`'s cached way, metres, for parameters without a batch.
+def posed_frame(avatar: Drivable, params: BodyParams) -> Float[np.ndarray, "V 3"]:
+    """Vertices of one frame as `Animation` makes them, metres, for parameters without a batch.
 
     For poses that come one at a time: nothing is compiled for a number of frames.
 
     **Raises:** `ValueError` for parameters that do not fit the body.
     """
     own = own_batch(avatar, params, "parameters")[0]
-    drive = _drive_frame(avatar.fields, avatar.body, own)
-    return np.asarray(
-        posed_vertices(avatar.neutral_surface, drive.conditions, drive.transforms, True)
-    )
+    return np.asarray(posed_vertices(avatar.rest, _drive(avatar.rest, avatar.body, own), True))
 
 
-_drive_frame = eqx.filter_jit(
-    lambda fields, body, params: Drive(
-        fields.geometry.condition(params), bone_transforms(body, params)
-    )
-)
-
-
-@eqx.filter_jit
-def _drive_block(fields: AvatarFields, body: BodyModel, params: BodyParams) -> Drive:
-    return jax.vmap(lambda p: _drive_frame(fields, body, p))(params)
-
-
-def drive_frames(fields: AvatarFields, body: BodyModel, params: BodyParams) -> Drive:
+def drive_frames(rest: AbstractRestSurface, body: BodyModel, params: BodyParams) -> Drive:
     """Conditions and transforms of all frames, a block of frames at a time: one compilation."""
     count = len(params)
     rows = np.minimum(np.arange(-(-count // _FRAME_BLOCK) * _FRAME_BLOCK), count - 1)
     blocks = [
-        _drive_block(fields, body, params[rows[k : k + _FRAME_BLOCK]])
+        _drive_block(rest, body, params[rows[k : k + _FRAME_BLOCK]])
         for k in range(0, len(rows), _FRAME_BLOCK)
     ]
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count].astype(np.float32), *blocks)
+
+
+@eqx.filter_jit
+def _drive(rest: AbstractRestSurface, body: BodyModel, params: BodyParams) -> Drive:
+    return Drive(rest.condition(params), bone_transforms(body, params))
+
+
+@eqx.filter_jit
+def _drive_block(rest: AbstractRestSurface, body: BodyModel, params: BodyParams) -> Drive:
+    return jax.vmap(lambda p: _drive(rest, body, p))(params)

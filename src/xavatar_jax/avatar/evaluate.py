@@ -1,46 +1,30 @@
-"""Metrics of an avatar on frames it has not seen."""
+"""Metrics of an avatar on held-out frames."""
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from ..body import BodyModel, BodyParams
 from ..frames import Frames, spread
+from ..learning import progress
 from ..meshing import Mesh
 from ..metrics import MeshMetrics, mean_metrics, surface_metrics
 from ..sampling import pose_distance
-from ..training.progress import progress
+from .protocol import Drivable, Mode
 
 GROUPS = ("near", "middle", "far")
 
 
-class Posable(Protocol):
-    """What can be evaluated: a person's surface in any pose of a body. An `Avatar` is one."""
-
-    @property
-    def body(self) -> BodyModel:
-        """The body that parameters are for, which tells hands and face from the rest."""
-        ...
-
-    def mesh(self, params: BodyParams, *, mode: Literal["fast", "full"] = "fast") -> Mesh:
-        """The posed surface of one frame, metres."""
-        ...
-
-    def posed_template(self, params: BodyParams) -> Float[np.ndarray, "V 3"]:
-        """Vertices of the body itself in this pose and the person's shape, metres."""
-        ...
-
-
 @dataclass(frozen=True)
 class Evaluation:
-    """The mean over frames, each frame's own, and which frames they were.
+    """The mean over frames, the metrics of each frame, and where the frames are from.
 
-    `pose_distance`: degrees from each frame's pose to the nearest training pose, where those
-    were given.
+    `pose_distance`: degrees from each frame's pose to the nearest training pose, if training
+    frames were given.
     """
 
     mean: MeshMetrics
@@ -49,9 +33,9 @@ class Evaluation:
     pose_distance: tuple[float, ...] | None = None
 
     def by_pose_distance(self) -> dict[str, Evaluation]:
-        """Thirds of the frames, from those nearest to a training pose to those farthest from one.
+        """Thirds of the frames, from the nearest to a training pose to the farthest.
 
-        Fewer than three frames make fewer groups. Empty if training poses were not given.
+        Fewer than three frames make fewer groups. Empty without training frames.
         """
         if self.pose_distance is None:
             return {}
@@ -88,22 +72,21 @@ class Evaluation:
 
 
 def evaluate(
-    avatar: Posable,
+    avatar: Drivable,
     frames: Frames,
     *,
     learned_from: Frames | None = None,
     num_frames: int | None = 24,
-    mode: Literal["fast", "full"] = "fast",
+    mode: Mode = "fast",
     seed: int = 0,
     verbose: bool = True,
 ) -> Evaluation:
-    """Compare posed avatar meshes with the frames' own meshes.
+    """Compare an avatar's posed surfaces with the meshes of frames.
 
-    `avatar` is an `Avatar`, or anything else that gives a mesh for a pose (`Posable`).
     `num_frames` are spread evenly over the sequences (None: all). Parts are those of the nearest
     vertex of the posed body, as in the reference's protocol. See `surface_metrics` for the
-    figures. With `learned_from`, the frames of training (`Fit.frames`; only their poses are
-    read), figures are also given by how far a pose is from those learned: see `pose_distance`.
+    figures. With `learned_from`, the training frames (`Fit.frames`; only their poses are read),
+    figures are also given by the distance to the nearest training pose: see `pose_distance`.
 
     **Raises:** `ValueError` for fewer frames than one, or frames of another tree than the avatar's;
     `EmptyLevelSetError` if the avatar has no surface.
@@ -112,19 +95,32 @@ def evaluate(
     distances = None
     if learned_from is not None:
         distances = tuple(pose_distance(chosen.params, learned_from.params).tolist())
-    labels = np.asarray(avatar.body.part_labels)
-    records = []
-    with progress("evaluation", len(chosen), verbose=verbose, unit="frame") as bar:
-        for k, frame in enumerate(chosen):
-            prediction = avatar.mesh(frame.params, mode=mode)
-            records.append(
-                surface_metrics(
-                    prediction,
-                    Mesh(frame.vertices, frame.faces),
-                    label_vertices=avatar.posed_template(frame.params),
-                    labels=labels,
-                    seed=seed + k,
-                )
-            )
+    parts = avatar.body.parts
+    records: list[MeshMetrics] = []
+    # Metrics of a frame are computed in NumPy while JAX makes the surface of the next one.
+    with (
+        progress("evaluation", len(chosen), verbose=verbose, unit="frame") as bar,
+        ThreadPoolExecutor(1) as worker,
+    ):
+
+        def finish(measured: Future[MeshMetrics]) -> None:
+            records.append(measured.result())
             bar.update(1)
+
+        waiting = None
+        for k, frame in enumerate(chosen):
+            task = partial(
+                surface_metrics,
+                avatar.surface(frame.params, mode=mode),
+                Mesh(frame.vertices, frame.faces),
+                label_vertices=avatar.posed_template(frame.params),
+                labels=np.asarray(parts.labels),
+                parts=parts,
+                seed=seed + k,
+            )
+            if waiting is not None:
+                finish(waiting)
+            waiting = worker.submit(task)
+        if waiting is not None:
+            finish(waiting)
     return Evaluation(mean_metrics(records), tuple(records), chosen.sources, distances)

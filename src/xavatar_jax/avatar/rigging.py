@@ -1,4 +1,4 @@
-"""An avatar as a rig: skeleton, weights, expressions as blend shapes, motions as clips."""
+"""A drivable avatar as a rig: skeleton, weights, expressions as blend shapes, motions as clips."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,20 +25,17 @@ from ..export import (
 )
 from ..files import atomic_path
 from ..kinematics import TO_Y_UP, KinematicTree
+from ..meshing import Mesh
 from .animate import (
     Animation,
     MotionLike,
-    NeutralSurface,
     Spread,
     animate,
     drive_frames,
-    offset_vertices,
     skin_columns,
     spread_frames,
 )
-
-if TYPE_CHECKING:
-    from .avatar import Avatar
+from .protocol import Drivable
 
 Motions = MotionLike | BodyParams | Mapping[str, MotionLike | BodyParams]
 _CHECKED_FRAMES = 24
@@ -45,13 +43,13 @@ _CHECKED_FRAMES = 24
 
 @dataclass(frozen=True, eq=False)
 class GlbExport:
-    """What a rigged file holds, and what it loses against `Avatar.animate`, millimetres.
+    """The contents of a rigged file, and its error against `animate`, millimetres.
 
-    - `influence_loss`: by the bones left out, over `checked` frames of the motions; None without
-      a motion.
-    - `total_loss`: with that, what blend shapes do not hold of expressions, and the offsets that
-      depend on pose, which a rig has no place for.
-    - `expression_scales`: the coefficients that the blend shapes' weights of one stand for.
+    - `influence_loss`: error from the bones left out, over `checked` frames of the motions; None
+      without a motion.
+    - `total_loss`: also from what blend shapes miss of expressions, and from the offsets that
+      depend on pose, which a rig cannot hold.
+    - `expression_scales`: coefficient of expression at a blend shape weight of one.
     """
 
     path: Path
@@ -83,7 +81,7 @@ class GlbExport:
 
 
 def export_glb(
-    avatar: Avatar,
+    avatar: Drivable,
     path: str | os.PathLike[str],
     motion: Motions | None = None,
     *,
@@ -93,9 +91,23 @@ def export_glb(
     up: Literal["y", "z"] | None = None,
     verbose: bool = True,
 ) -> GlbExport:
-    """See `Avatar.export_glb`."""
+    """Write a rigged `.glb`: mesh, skeleton, weights, expressions as blend shapes, clips.
+
+    `motion` is one motion, parameters `(T, ...)` at 30 frames per second, or several by the names
+    of their clips. The file is in metres with y up, whatever the up axis of the motions (`up` for
+    parameters, default y). Eight `influences` lose less than four; Blender reads them, three.js
+    takes the first four. `expressions`: how many coefficients get blend shapes, the first ones
+    (True: all; False or 0: none). `colors` are sRGB, one row per vertex of `avatar.rest`, and
+    replace the avatar's own.
+
+    The error against `animate` is measured on 24 frames, returned, and printed unless `verbose`
+    is false. The file appears whole or not at all.
+
+    **Raises:** `ValueError` for a name that does not end in `.glb`, or as for `animate`;
+    `OSError` if the file cannot be written.
+    """
     check_glb_path(path)
-    with atomic_path(path) as temporary:  # first of all: an unwritable path costs no minute
+    with atomic_path(path) as temporary:  # first: an unwritable path must not cost a minute
         animations = {name: animate(avatar, each) for name, each in _named(motion).items()}
         ups = {name: up or getattr(each, "up", "y") for name, each in _named(motion).items()}
         scales = expression_scales(avatar, list(animations.values()), expressions)
@@ -124,24 +136,24 @@ def export_glb(
     return report
 
 
-def export_weights(avatar: Avatar, path: str | os.PathLike[str]) -> None:
+def export_weights(avatar: Drivable, path: str | os.PathLike[str]) -> None:
     """See `Avatar.export_weights`."""
     write_weights(path, build_rig(avatar))
 
 
 def expression_scales(
-    avatar: Avatar, animations: list[Animation], expressions: bool | int = True
+    avatar: Drivable, animations: list[Animation], expressions: bool | int = True
 ) -> Float[np.ndarray, " E"] | None:
-    """The coefficient that a blend shape's weight of one stands for: the largest, at least 1.
+    """The coefficient at a blend shape weight of one: the largest that occurs, at least 1.
 
-    `expressions`: how many coefficients get blend shapes, the first ones; True: all that the
-    avatar has; False: none.
+    `expressions`: how many coefficients get blend shapes, the first ones; True: all that move
+    the avatar; False: none.
 
     **Raises:** `ValueError` for more than it has, or fewer than none.
     """
     if expressions is False:
         return None
-    count = canonical_params(avatar.body).expression.shape[-1]
+    count = avatar.rest.num_expression
     if expressions is not True:
         if not 0 <= expressions <= count:
             raise ValueError(
@@ -156,54 +168,56 @@ def expression_scales(
 
 
 def build_rig(
-    avatar: Avatar,
+    avatar: Drivable,
     scales: Float[np.ndarray, " E"] | None = None,
     *,
     colors: UInt8[np.ndarray, "V C"] | None = None,
 ) -> Rig:
-    """The neutral surface on the canonical skeleton of the avatar's shape.
+    """The rest surface on the canonical skeleton of the avatar's shape.
 
-    With `scales` it has two blend shapes a coefficient of expression, one a sign, so that all
-    weights lie between 0 and 1: Blender cuts off others on import.
+    With `scales` it has two blend shapes per coefficient of expression, one per sign, so that all
+    weights are between 0 and 1: Blender clips others on import.
     """
-    base, tree = avatar.neutral_surface, avatar.body.tree
-    mesh = replace(avatar.canonical_mesh(), vertices=np.asarray(base.vertices).T)
-    if colors is not None:
-        mesh = replace(mesh, colors=colors)
+    rest, tree = avatar.rest, avatar.body.tree
+    colors = rest.colors if colors is None else colors
+    mesh = Mesh(np.asarray(rest.vertices).T, rest.faces, colors=colors)
     joints = np.asarray(rest_joints(avatar.body, jnp.asarray(avatar.betas)), np.float64)
     scales = np.zeros(0) if scales is None else scales
     return Rig(
         mesh=mesh.compute_normals(),
-        weights=np.asarray(base.weights).T,
+        weights=np.asarray(rest.weights).T,
         tree=tree,
         rotations=_matrices(np.asarray(canonical_pose(avatar.body))),
         translations=_to_parent(tree, joints[None])[0],
-        targets=expression_targets(avatar, base, scales),
+        targets=_expression_targets(avatar, scales),
         target_names=tuple(
             f"expression_{k}_{side}" for side in ("plus", "minus") for k in range(len(scales))
         ),
     )
 
 
-def expression_targets(
-    avatar: Avatar, base: NeutralSurface, scales: Float[np.ndarray, " E"]
+def _expression_targets(
+    avatar: Drivable, scales: Float[np.ndarray, " E"]
 ) -> Float[np.ndarray, "T V 3"]:
-    """How each coefficient moves the neutral pose's vertices: all at +1, then all at -1, scaled."""
-    count = len(scales)
+    """How each coefficient moves the neutral vertices: all at +1, then all at -1, scaled."""
+    count, surface = len(scales), avatar.rest
     if not count:
-        return np.zeros((0, base.vertices.shape[1], 3))
+        return np.zeros((0, surface.vertices.shape[1], 3))
     neutral = canonical_params(avatar.body, jnp.asarray(avatar.betas))
     unit = np.eye(count, neutral.expression.shape[-1])
     both = np.concatenate([unit, -unit])
     params = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], len(both), 0), neutral)
     params = replace(params, expression=both.astype(params.pose.dtype))
-    conditions = drive_frames(avatar.fields, avatar.body, params).conditions
-    rest = np.asarray(base.vertices)
+    conditions = drive_frames(surface, avatar.body, params).conditions
+    rest = np.asarray(surface.vertices)
     shapes = []
     for k, scale in enumerate(np.tile(scales, 2)):
         condition = jax.tree.map(lambda leaf, k=k: leaf[k], conditions)
-        shapes.append(scale * (np.asarray(offset_vertices(base, condition)) - rest).T)
+        shapes.append(scale * (np.asarray(_under(surface, condition)) - rest).T)
     return np.stack(shapes)
+
+
+_under = eqx.filter_jit(lambda rest, condition: rest.under(condition))
 
 
 def build_clip(
@@ -215,7 +229,7 @@ def build_clip(
 ) -> Clip:
     """A motion as rotations and translations of the rig's joints, turned so that y is up.
 
-    Expression moves the joints of eyes and jaw a little: their translations follow it.
+    Expression moves the joints of eyes and jaw a little; their translations follow.
 
     **Raises:** `ValueError` for another up axis than y and z.
     """
@@ -240,7 +254,7 @@ def build_clip(
 def measure_losses(
     rig: Rig, pairs: list[tuple[Animation, Clip]], influences: int
 ) -> tuple[Spread | None, Spread | None, int]:
-    """What few influences lose, what the whole rig loses, and over how many frames."""
+    """Error of few influences, of the whole rig, and over how many frames."""
     if not pairs:
         return None, None, 0
     few = jnp.asarray(limit_influences(rig.weights, influences).dense(rig.tree.num_joints).T)
@@ -251,7 +265,7 @@ def measure_losses(
         for k in spread_frames(len(animation), max(_CHECKED_FRAMES // len(pairs), 1)):
             moved = (clip.coefficients[k] @ shapes).reshape(-1, 3)
             points = jnp.asarray((rig.mesh.vertices + moved).T, jnp.float32)
-            transforms = animation.drive.transforms[k]
+            transforms = jnp.asarray(animation.drive.transforms[k])
             rigged, skinned = (
                 np.asarray(skin_columns(points, w, transforms)) for w in (few, every)
             )
@@ -270,7 +284,7 @@ def _named(motion: Motions | None) -> dict[str, Any]:
 
 
 def _matrices(pose: np.ndarray) -> Float[np.ndarray, "... 3 3"]:
-    # In NumPy: a file is written once, for any number of frames, and nothing is compiled for it.
+    # Not in JAX: it would compile for every number of frames, for a file that is written once.
     from scipy.spatial.transform import Rotation
 
     writable = np.array(pose, np.float64)  # SciPy refuses the read-only views that JAX gives

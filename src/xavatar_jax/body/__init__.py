@@ -1,18 +1,13 @@
-"""Body models of the SMPL family and any other tree: parameters, loading, posing."""
+"""Body models of the SMPL family and of any other joint tree: parameters, loading, posing."""
 
 from .adapter import body_from_model as body_from_model
 from .adapter import params_from_model as params_from_model
-from .hands import hands_to_absolute as hands_to_absolute
-from .hands import hands_to_relative as hands_to_relative
-from .heading import facing as facing
-from .heading import root_rotation as root_rotation
 from .joints import SMPL_TREE as SMPL_TREE
 from .joints import SMPLH_TREE as SMPLH_TREE
 from .joints import SMPLX_TREE as SMPLX_TREE
 from .joints import mano_tree as mano_tree
 from .joints import pose_groups as pose_groups
 from .load import load_body as load_body
-from .load import synthetic_body as synthetic_body
 from .model import BodyModel as BodyModel
 from .model import BodySource as BodySource
 from .model import Posed as Posed
@@ -29,13 +24,16 @@ from .model import rest_vertices as rest_vertices
 from .model import with_template as with_template
 from .params import BodyParams as BodyParams
 from .params import check_params as check_params
+from .params import facing as facing
+from .params import hands_to_absolute as hands_to_absolute
+from .params import hands_to_relative as hands_to_relative
+from .params import root_rotation as root_rotation
 from .params import with_betas as with_betas
-from .parts import BODY as BODY
-from .parts import EYES_MOUTH as EYES_MOUTH
-from .parts import FACE as FACE
-from .parts import FACES as FACES
-from .parts import HANDS as HANDS
-from .parts import LEFT_HAND as LEFT_HAND
-from .parts import PARTS as PARTS
-from .parts import RIGHT_HAND as RIGHT_HAND
+from .parts import STANDARD_PARTS as STANDARD_PARTS
+from .parts import Group as Group
+from .parts import Part as Part
+from .parts import Parts as Parts
+from .parts import Piece as Piece
 from .parts import derive_part_labels as derive_part_labels
+from .parts import part_groups as part_groups
+from .parts import standard_parts as standard_parts

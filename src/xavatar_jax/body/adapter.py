@@ -1,4 +1,4 @@
-"""Bodies of the package `body-models` (ANNY, MHR, the SMPL family) as bodies of this library."""
+"""Convert bodies of the package `body-models` (ANNY, MHR, the SMPL family)."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..kinematics import KinematicTree, matrix_to_axis_angle
-from .identity import body_checksum
-from .model import BodyModel, BodySource
+from .model import BodyModel, BodySource, body_checksum, make_body
 from .params import BodyParams
-from .parts import derive_part_labels
+from .parts import derive_part_labels, standard_parts
 
 _PHALANGES = {"mcp": 1, "pip": 2, "dip": 3}
 _THUMB = {"cmc": 1, "mcp": 2, "ip": 3}
-# Joints that the package's common vocabulary leaves out, by the names its models give them.
+# Joints missing from the package's common vocabulary, by the names in its models.
 _MORE_NAMES = {"jaw": "jaw", "eye.L": "left_eye", "eye.R": "right_eye"}
-# A joint that ends up further from where the model puts it has moved along its bone.
-_RIGID_M = 1e-3
-_REGRESSED_FROM = 64  # vertices nearest to a joint
+_RIGID_M = 1e-3  # largest change of a bone's length
+_REGRESSED_FROM = 64  # number of vertices that a joint is regressed from
 
 
 def body_from_model(
@@ -33,15 +31,15 @@ def body_from_model(
 ) -> BodyModel:
     """A body with the mesh, tree and skinning weights of a model of the package `body-models`.
 
-    `model` is a `body_models.SkinnedModel`, or a name that `body_models.create_model` knows
-    ("anny"). The person's shape is part of the result, which has no shape or expression
-    coefficients: `identity` gives the model's own parameters of that role (default: its rest
-    values). Pose correctives are not taken over; an avatar learns its own. Joints take SMPL-X's
-    names where the package knows what they are, by which parts and starts are found; `names`
-    adds to that, from the model's name to SMPL-X's.
+    The result has no shape or expression coefficients and no pose correctives (an avatar learns
+    them). Joints known to the package get SMPL-X's names, from which parts and starts are found.
 
-    **Raises:** `FileNotFoundError` with the command that fetches a model's files; `ValueError`
-    for unknown identity parameters, or joint names that repeat.
+    - `model`: a `body_models.SkinnedModel`, or a name for `body_models.create_model` ("anny").
+    - `identity`: the model's parameters of the person's shape. Default: its rest values.
+    - `names`: more joint names, from the model's to SMPL-X's.
+
+    **Raises:** `FileNotFoundError` with the command that downloads the model's files;
+    `ValueError` for unknown identity parameters or repeated joint names.
     """
     model = _create(model) if isinstance(model, str) else model
     vertices, bind = _rest(model, identity)
@@ -54,28 +52,13 @@ def body_from_model(
     joints = bind[list(order), :3, 3]
     weights = np.asarray(model.skinning_spec.skinning_weights, np.float64)[:, list(order)]
     faces = np.asarray(model.skinning_spec.triangles, np.int32)
-    regressor = _regressor(joints, vertices)
-    dtype = jnp.asarray(0.0).dtype
-
-    def cast(value: np.ndarray) -> Any:
-        return jnp.asarray(value, dtype)
-
-    count, bones = len(vertices), len(joints)
-    return BodyModel(
-        template=cast(vertices),
+    return make_body(
+        template=vertices,
         faces=faces,
-        shape_dirs=cast(np.zeros((count, 3, 0))),
-        expression_dirs=cast(np.zeros((count, 3, 0))),
-        pose_dirs=cast(np.zeros((count, 3, 9 * (bones - 1)))),
-        joint_regressor=cast(regressor),
-        joint_template=cast(joints),
-        joint_shape_dirs=cast(np.zeros((bones, 3, 0))),
-        joint_expression_dirs=cast(np.zeros((bones, 3, 0))),
-        weights=cast(weights / weights.sum(1, keepdims=True)),
-        part_labels=derive_part_labels(tree, weights),
-        colors=None,
-        hand_mean=cast(np.zeros((bones, 3))),
-        hand_components={},
+        joint_regressor=_regressor(joints, vertices),
+        joints=joints,
+        weights=weights / weights.sum(1, keepdims=True),
+        parts=standard_parts(tree, derive_part_labels(tree, weights)),
         tree=tree,
         source=BodySource(
             path=f"body-models:{type(model).__name__}",
@@ -93,13 +76,13 @@ def params_from_model(
     *,
     identity: Mapping[str, Any] | None = None,
 ) -> BodyParams:
-    """Parameters of `body_from_model(model, identity=identity)` for a pose of the model's own.
+    """Convert pose parameters of a model to those of `body_from_model(model, identity=identity)`.
 
-    `parameters` are arguments of the model's `forward_vertices` but for its identity, one frame or
-    a batch of them; what is left out is at rest.
+    `parameters` are arguments of the model's `forward_vertices` other than its identity, for one
+    frame or a batch; the others keep their rest values.
 
-    **Raises:** `ValueError` for unknown parameters, for a body that is not the model's, or naming
-    the joint where a pose stretches a bone, which rotations cannot say.
+    **Raises:** `ValueError` for unknown parameters, for another model's body, or naming the joint
+    where a pose stretches a bone, which rotations cannot express.
     """
     vertices, bind = _rest(model, identity)
     if vertices.shape != body.template.shape or len(bind) != body.num_joints:
@@ -112,7 +95,7 @@ def params_from_model(
     _only_known("parameters", parameters, known)
     whole = {**_at_rest(model, identity), **parameters}
     leading = {n: np.ndim(v) - len(model.parameter_spec[n].dims) for n, v in whole.items()}
-    # What is left out takes the batch of what is given.
+    # Rest values are broadcast to the batch of the given parameters.
     batch = np.broadcast_shapes(*(np.shape(v)[: leading[n]] for n, v in whole.items()))
     whole = {n: np.broadcast_to(v, (*batch, *np.shape(v)[leading[n] :])) for n, v in whole.items()}
     order = list(_parents_first(model.parents))
@@ -144,15 +127,15 @@ def _create(name: str) -> Any:
         return body_models.create_model(name, runtime="numpy")
     except ValueError:
         raise
-    except Exception as error:  # it fetches what is missing, and fails in as many ways as a network
+    except Exception as error:  # the package downloads missing files; any network error may occur
         raise FileNotFoundError(
-            f"the files of {name} are not at hand ({error}); `body-models download {name}` "
-            "fetches them where there is a network"
+            f"the files of {name} are missing ({error}); `body-models download {name}` "
+            "downloads them"
         ) from error
 
 
 def _at_rest(model: Any, identity: Mapping[str, Any] | None) -> dict[str, np.ndarray]:
-    """Every parameter of one frame: rest values, and the identity asked for."""
+    """All parameters of one frame: rest values and the given identity."""
     specs = model.parameter_spec
     of_person = {name for name, spec in specs.items() if spec.role == "identity"}
     _only_known("identity", identity or {}, of_person)
@@ -161,7 +144,7 @@ def _at_rest(model: Any, identity: Mapping[str, Any] | None) -> dict[str, np.nda
 
 
 def _rest(model: Any, identity: Mapping[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices `(V, 3)` and bone frames `(J, 4, 4)` that the skinning weights were bound at."""
+    """Vertices `(V, 3)` and bone frames `(J, 4, 4)` of the bind pose."""
     rest = _typed(model, _at_rest(model, identity))
     person = {n: rest[n] for n, spec in model.parameter_spec.items() if spec.role == "identity"}
     prepared = model.prepare_identity(**person)
@@ -176,11 +159,9 @@ def _rest(model: Any, identity: Mapping[str, Any] | None) -> tuple[np.ndarray, n
 
 
 def _typed(model: Any, values: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Arrays as the model's runtime wants them."""
-    like = model.rest_vertices
-    return {
-        name: model.runtime.asarray(np.array(value), like=like) for name, value in values.items()
-    }
+    """Convert arrays to the type of the model's runtime."""
+    convert, like = model.runtime.asarray, model.rest_vertices
+    return {name: convert(np.array(value), like=like) for name, value in values.items()}
 
 
 def _only_known(what: str, given: Mapping[str, Any], known: set[str]) -> None:
@@ -192,7 +173,7 @@ def _only_known(what: str, given: Mapping[str, Any], known: set[str]) -> None:
 
 
 def _parents_first(parents: Any) -> tuple[int, ...]:
-    """Joints in the model's order, but for those that it lists before their parents; one root."""
+    """Joints in the model's order, except that parents come before their children."""
     parents = [int(p) for p in parents]
     roots = sum(parent < 0 for parent in parents)
     if roots != 1:
@@ -207,18 +188,18 @@ def _parents_first(parents: Any) -> tuple[int, ...]:
 
 
 def _known_names(model: Any, more: Mapping[str, str]) -> dict[str, str]:
-    """SMPL-X's names of the model's joints, where it is known what they are."""
+    """SMPL-X's names of the model's joints, where they are known."""
     found = {native: name for native, name in _MORE_NAMES.items() if native in model.joint_names}
     for joint, native in model.common_joints.items():
         found[native] = _smplx_name(str(joint.value))
     unknown = sorted(set(more) - set(model.joint_names))
     if unknown:
-        raise ValueError(f"names has {', '.join(unknown)}, which are no joints of the model")
+        raise ValueError(f"names has {', '.join(unknown)}, which are not joints of the model")
     return {**found, **more}
 
 
 def _smplx_name(common: str) -> str:
-    """`left_index_mcp` is `left_index1`, `left_thumb_cmc` is `left_thumb1`; others stay."""
+    """Map `left_index_mcp` to `left_index1`, `left_thumb_cmc` to `left_thumb1`, and so on."""
     side, _, rest = common.partition("_")
     finger, _, joint = rest.partition("_")
     number = (_THUMB if finger == "thumb" else _PHALANGES).get(joint)
@@ -228,7 +209,7 @@ def _smplx_name(common: str) -> str:
 def _regressor(
     joints: Float[np.ndarray, "J 3"], vertices: Float[np.ndarray, "V 3"]
 ) -> Float[np.ndarray, "J V"]:
-    """Affine combinations of near vertices that give the joints: of all, those of least norm."""
+    """Least-norm affine combinations of near vertices that give the joints."""
     from scipy.spatial import cKDTree
 
     count = min(_REGRESSED_FROM, len(vertices))
@@ -243,7 +224,7 @@ def _regressor(
 def _check_rigid(
     body: BodyModel, turned: np.ndarray, joints: np.ndarray, reached: np.ndarray
 ) -> None:
-    """Joints are where rotations about their parents put them."""
+    """Check that rotations about the parents give the joint positions."""
     parents = np.asarray(body.tree.parents)[1:]
     bone = (turned[..., parents, :, :] @ (joints[1:] - joints[parents])[..., None])[..., 0]
     gap = np.linalg.norm(reached[..., 1:, :] - reached[..., parents, :] - bone, axis=-1)
@@ -251,6 +232,6 @@ def _check_rigid(
     if worst.max() > _RIGID_M:
         joint = body.tree.names[1 + int(worst.argmax())]
         raise ValueError(
-            f"the pose moves {joint} by {1e3 * worst.max():.1f} mm along its bone; an avatar is "
-            "driven by rotations alone: leave out parameters that stretch bones"
+            f"the pose moves {joint} by {1e3 * worst.max():.1f} mm along its bone; avatars "
+            "are driven by rotations only: leave out parameters that stretch bones"
         )

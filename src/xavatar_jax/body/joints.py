@@ -1,4 +1,4 @@
-"""Joint names and trees of the SMPL family, as data."""
+"""Joint names and trees of the SMPL family."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ SMPLX_TREE = KinematicTree(
     (*_BODY, "jaw", "left_eye", "right_eye", *_hand_names("left"), *_hand_names("right")),
     (*_BODY_PARENTS, 15, 15, 15, *_hand_parents(20, 25), *_hand_parents(21, 40)),
 )
-"""The 55 joints of SMPL-X: body, jaw, eyes, two hands."""
+"""The 55 joints of SMPL-X: body, jaw, eyes and two hands."""
 SMPLH_TREE = KinematicTree(
     (*_BODY, *_hand_names("left"), *_hand_names("right")),
     (*_BODY_PARENTS, *_hand_parents(20, 22), *_hand_parents(21, 37)),
 )
-"""The 52 joints of SMPL-H: body, two hands."""
+"""The 52 joints of SMPL-H: body and two hands."""
 SMPL_TREE = KinematicTree((*_BODY, "left_hand", "right_hand"), (*_BODY_PARENTS, 20, 21))
-"""The 24 joints of SMPL: body, and one joint a hand."""
+"""The 24 joints of SMPL: body and one joint per hand."""
 
 
 def mano_tree(side: str) -> KinematicTree:
@@ -42,26 +42,22 @@ def mano_tree(side: str) -> KinematicTree:
 
 
 def pose_groups(tree: KinematicTree) -> dict[str, tuple[int, ...]]:
-    """Joints behind each of SMPL-X's parameter names, found by joint name.
+    """Joint indices of each of SMPL-X's pose parameters, found by joint name.
 
-    A tree without hands, jaw or eyes has empty groups; every joint that belongs to no other
-    group is part of `body_pose`, so the groups cover any tree.
+    Groups of joints that the tree lacks are empty. Joints of no other group belong to `body_pose`.
     """
-    fingers = {
-        side: tuple(
-            j
-            for j, name in enumerate(tree.names)
-            if name.startswith(f"{side}_") and name[len(side) + 1 : -1] in FINGERS
-        )
-        for side in ("left", "right")
-    }
+
+    def fingers(side: str) -> tuple[int, ...]:
+        stems = [f"{side}_{finger}" for finger in FINGERS]
+        return tuple(j for j, name in enumerate(tree.names) if name[:-1] in stems)
+
     groups = {
         "global_orient": (0,),
         "jaw_pose": tree.indices("jaw"),
         "leye_pose": tree.indices("left_eye"),
         "reye_pose": tree.indices("right_eye"),
-        "left_hand_pose": fingers["left"],
-        "right_hand_pose": fingers["right"],
+        "left_hand_pose": fingers("left"),
+        "right_hand_pose": fingers("right"),
     }
     taken = {joint for group in groups.values() for joint in group}
     groups["body_pose"] = tuple(j for j in range(tree.num_joints) if j not in taken)

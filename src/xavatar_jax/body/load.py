@@ -1,4 +1,4 @@
-"""Read body models of the SMPL family, and any other tree in the same layout."""
+"""Read body models of the SMPL family, and of any other joint tree in the same layout."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from ..files import cache_dir, load_npz, load_pickle
+from ..files import load_npz, load_pickle
 from ..kinematics import KinematicTree
-from .identity import body_checksum
 from .joints import SMPL_TREE, SMPLH_TREE, SMPLX_TREE, mano_tree, pose_groups
-from .model import BodyModel, BodySource
-from .parts import PARTS, derive_part_labels
+from .model import BodyModel, BodySource, body_checksum, make_body
+from .parts import STANDARD_PARTS, derive_part_labels, standard_parts
 
 _DOWNLOADS = {
     "smplx": "https://smpl-x.is.tue.mpg.de",
@@ -23,9 +21,13 @@ _DOWNLOADS = {
     "mano": "https://mano.is.tue.mpg.de",
     "smpl": "https://smpl.is.tue.mpg.de",
 }
-_SHAPE_SPACE = 300  # SMPL-X: shape in columns 0 to 299, expression from 300
-_OLD_SHAPE_SPACE = 10  # first SMPL-X release: ten of each
-_ROUNDED = 1e-3  # of a row of weights: what float16 leaves
+_SHAPE_SPACE = 300  # SMPL-X 1.1: shape in columns 0 to 299, expression from 300
+_OLD_SHAPE_SPACE = 10  # SMPL-X 1.0: ten of each
+_ROUNDED = 1e-3  # rounding error of a row of weights stored as float16
+_REGRESSED = 1e-2  # largest difference from one of a row of the joint regressor
+_EXTENT_M = (0.02, 10.0)  # smallest and largest size of a template
+_LARGEST = 1e10  # largest magnitude of any other number in a model file
+_GENDERS = ("neutral", "female", "male")
 
 
 def load_body(
@@ -36,16 +38,20 @@ def load_body(
     num_betas: int | None = None,
     num_expression: int | None = None,
 ) -> BodyModel:
-    """Load a SMPL, SMPL-H, SMPL-X or MANO model, or another tree in the same layout.
+    """Load a SMPL, SMPL-H, SMPL-X or MANO model, or another joint tree in the same layout.
 
     `path` is an `.npz` or `.pkl` file, or a folder in the layout of `smplx.create`
-    (`DIR/smplx/SMPLX_NEUTRAL.npz`), where `kind` and `gender` choose the file. Without a path the
-    environment variable `SMPLX_MODEL_DIR` is used. Pickles and object arrays are read under
-    restriction; chumpy is not needed. `num_betas` and `num_expression` keep fewer columns than the
-    file has. Arrays are float32, or float64 when `jax_enable_x64` is on.
+    (`DIR/smplx/SMPLX_NEUTRAL.npz`) or of the downloads (`DIR/smplh/male/model.npz`,
+    `DIR/smpl/basicmodel_f_lbs_10_207_0_v1.1.0.pkl`), where `kind` and `gender` choose the file.
+    The default path is the environment variable `SMPLX_MODEL_DIR`. A gender in the name of the
+    file or its folder takes precedence over `gender`.
+
+    Pickles and object arrays are read without executing code; chumpy is not needed. `num_betas`
+    and `num_expression` limit the columns that are kept. Arrays are float32, or float64 when
+    `jax_enable_x64` is on.
 
     **Raises:** `FileNotFoundError` with the paths tried and where to get the model; `ValueError`
-    naming the file, the entry, the shape found and the shape expected.
+    naming the file, the entry, the value found and the value expected.
     """
     file = _find(path, kind, gender)
     suffix = file.suffix.lower()
@@ -60,20 +66,6 @@ def load_body(
     return _build(file, data, gender, num_betas, num_expression)
 
 
-def synthetic_body(cache: str | os.PathLike[str] | None = None) -> BodyModel:
-    """The bundled human, made by code on first use (under a minute) and kept in the cache folder.
-
-    An SMPL-X tree, ten shape and ten expression directions, free of any licence but this project's.
-    `cache` overrides the user's cache folder.
-    """
-    from .synthetic import SYNTHETIC_BODY_VERSION, write_synthetic_body
-
-    path = cache_dir(cache) / f"synthetic_body-{SYNTHETIC_BODY_VERSION}.npz"
-    if not path.exists():
-        write_synthetic_body(path)
-    return load_body(path, num_betas=10, num_expression=10)
-
-
 def _find(path: str | os.PathLike[str] | None, kind: str, gender: str) -> Path:
     if path is None:
         path = os.environ.get("SMPLX_MODEL_DIR")
@@ -85,81 +77,63 @@ def _find(path: str | os.PathLike[str] | None, kind: str, gender: str) -> Path:
     root = Path(path).expanduser()
     if root.is_file():
         return root
-    name = f"{kind.upper()}_{gender.upper()}"
-    tried = [root] if not root.is_dir() else []
-    if root.is_dir():
-        tried = [
-            folder / f"{name}{suffix}"
-            for folder in (root / kind.lower(), root)
-            for suffix in (".npz", ".pkl")
-        ]
-        for candidate in tried:
-            if candidate.is_file():
-                return candidate
+    kind, gender = kind.lower(), gender.lower()
+    tried = [root] if not root.is_dir() else [
+        folder / f"{name}{suffix}"
+        for name in (f"{kind}_{gender}".upper(), f"{gender}/model", f"basic[mM]odel_{gender}_*",
+                     f"basic[mM]odel_{gender[:1]}_*")
+        for folder in (root / kind, root)
+        for suffix in (".npz", ".pkl")
+    ]  # fmt: skip
+    for candidate in tried:
+        found = sorted(root.glob(candidate.relative_to(root).as_posix())) if root.is_dir() else []
+        if found and found[0].is_file():
+            return found[0]
     listing = "\n  ".join(str(candidate) for candidate in tried)
     raise FileNotFoundError(
         f"no body model found. Tried:\n  {listing}\n"
-        f"Download {kind.upper()} from {_DOWNLOADS.get(kind.lower(), 'its own site')} (its licence "
-        "forbids shipping it here), or use xavatar_jax.synthetic_body()."
+        f"Download {kind.upper()} from {_DOWNLOADS.get(kind.lower(), 'its website')} (its licence "
+        "does not allow this library to include it), or use xavatar_jax.synthetic_body()."
     )
 
 
 def _build(
-    file: Path,
-    data: dict[str, Any],
-    gender: str,
-    num_betas: int | None,
-    num_expression: int | None,
+    file: Path, data: dict[str, Any], gender: str, num_betas: int | None, num_expression: int | None
 ) -> BodyModel:
     template = _array(file, data, "v_template", (None, 3))
     vertices = len(template)
-    parents = _array(file, data, "kintree_table", (2, None))[0].astype(np.int64)
+    parents = _integers(file, data, "kintree_table", (2, None))[0]
     joints = len(parents)
     tree, kind = _tree(file, data, parents)
-    faces = _array(file, data, "f", (None, 3)).astype(np.int32)
-    if len(faces) and (faces.min() < 0 or faces.max() >= vertices):
-        raise ValueError(f"{file}: f refers to vertex {faces.max()}, but there are {vertices}")
+    faces = _integers(file, data, "f", (None, 3), most=vertices - 1).astype(np.int32)
     weights = _weights(file, data, (vertices, joints))
-    regressor = _dense(data.get("J_regressor"))
-    regressor = _array(file, {"J_regressor": regressor}, "J_regressor", (joints, vertices))
+    _check_size(file, template, faces)
+    regressor = _array(file, data, "J_regressor", (joints, vertices))
+    _check_regressor(file, regressor, tree)
     posedirs = _array(file, data, "posedirs", (vertices, 3, 9 * (joints - 1)))
     shapedirs = _array(file, data, "shapedirs", (vertices, 3, None))
     shape, expression = _split_shape(shapedirs, kind, num_betas, num_expression, file)
     mean, components = _hands(file, data, tree)
-    labels = data.get("part_labels")
-    if labels is None:
+    if data.get("part_labels") is None:
         labels = derive_part_labels(tree, weights)
     else:
-        labels = _array(file, data, "part_labels", (vertices,)).astype(np.int8)
-        if labels.min() < 0 or labels.max() >= len(PARTS):
-            raise ValueError(f"{file}: part_labels must be 0 to {len(PARTS) - 1}")
+        labels = _integers(file, data, "part_labels", (vertices,), most=len(STANDARD_PARTS) - 1)
+        labels = labels.astype(np.int8)
     colors = data.get("vertex_colors")
     if colors is not None:
-        colors = _array(file, data, "vertex_colors", (vertices, 3)).astype(np.uint8)
+        colors = _integers(file, data, "vertex_colors", (vertices, 3), most=255).astype(np.uint8)
 
-    dtype = jnp.asarray(0.0).dtype  # float64 when x64 is on
-
-    def regress(directions: np.ndarray) -> np.ndarray:
-        # In float64: a row sums over thousands of vertices.
-        return np.tensordot(regressor.astype(np.float64), directions.astype(np.float64), axes=1)
-
-    def cast(value: np.ndarray) -> Any:
-        return jnp.asarray(value, dtype)
-
-    return BodyModel(
-        template=cast(template),
+    return make_body(
+        template=template,
         faces=faces,
-        shape_dirs=cast(shape),
-        expression_dirs=cast(expression),
-        pose_dirs=cast(posedirs),
-        joint_regressor=cast(regressor),
-        joint_template=cast(regress(template)),
-        joint_shape_dirs=cast(regress(shape)),
-        joint_expression_dirs=cast(regress(expression)),
-        weights=cast(weights),
-        part_labels=labels,
+        shape_dirs=shape,
+        expression_dirs=expression,
+        pose_dirs=posedirs,
+        joint_regressor=regressor,
+        weights=weights,
+        parts=standard_parts(tree, labels),
         colors=colors,
-        hand_mean=cast(mean),
+        hand_mean=mean,
         hand_components=components,
         tree=tree,
         source=BodySource(
@@ -174,46 +148,107 @@ def _build(
 
 
 def _array(file: Path, data: dict[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """An entry of real, finite numbers with the given shape (None: any size)."""
     if data.get(key) is None:
         present = ", ".join(sorted(map(str, data)))
         raise ValueError(f"{file}: no entry {key!r}; the file has {present}")
-    array = np.asarray(_dense(data[key]))
+    value = data[key]
+    try:
+        array = np.asarray(value.toarray() if hasattr(value, "toarray") else value)
+    except ValueError as error:  # nested lists of different lengths
+        raise ValueError(f"{file}: {key} is not an array of numbers: {error}") from None
     expected = tuple("n" if size is None else size for size in shape)
+    if array.dtype.kind not in "buif":
+        raise ValueError(
+            f"{file}: {key} has the type {array.dtype}, expected real numbers of shape {expected}"
+        )
     if array.ndim != len(shape) or any(
         size is not None and size != found for size, found in zip(shape, array.shape, strict=True)
     ):
         raise ValueError(
-            f"{file}: {key} has shape {array.shape}, expected {expected}. Is it the model you "
-            "meant, and whole?"
+            f"{file}: {key} has shape {array.shape}, expected {expected}. Check that this is the "
+            "intended model and that the file is complete"
         )
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    if array.dtype.kind != "f":
+        return array
+    if not np.isfinite(array).all():
         raise ValueError(f"{file}: {key} has entries that are not finite")
+    largest = max(array.max(initial=0.0), -array.min(initial=0.0))
+    if largest > _LARGEST:
+        raise ValueError(
+            f"{file}: {key} has entries as large as {largest:.3g}, expected at most {_LARGEST:g}"
+        )
     return array
 
 
+def _integers(
+    file: Path,
+    data: dict[str, Any],
+    key: str,
+    shape: tuple[int | None, ...],
+    most: int | None = None,
+) -> np.ndarray:
+    """An entry of integers, stored as any type, in 0 to `most` if that is given."""
+    array = _array(file, data, key, shape)
+    whole = array.astype(np.int64)
+    if array.dtype.kind == "f" and (whole != array).any():
+        value = array[whole != array].flat[0]
+        raise ValueError(f"{file}: {key} holds {value:g}, expected whole numbers")
+    if most is not None and whole.size and (whole.min() < 0 or whole.max() > most):
+        value = whole.min() if whole.min() < 0 else whole.max()
+        raise ValueError(f"{file}: {key} holds {value}, expected 0 to {most}")
+    return whole
+
+
+def _check_size(file: Path, template: np.ndarray, faces: np.ndarray) -> None:
+    """Check that the template is in metres and that its triangles have an area."""
+    if not len(template):
+        raise ValueError(f"{file}: v_template has no vertices")
+    extent = float(np.ptp(template.astype(np.float64), axis=0).max())
+    least, most = _EXTENT_M
+    if not least <= extent <= most:
+        raise ValueError(
+            f"{file}: v_template extends over {extent:.4g}, expected {least:g} to {most:g} metres. "
+            "Templates in millimetres or centimetres must be scaled, as must shapedirs and posedirs"
+        )
+    a, b, c = (template[faces[:, k]].astype(np.float64) for k in range(3))
+    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    if area < 1e-6 * extent**2:
+        raise ValueError(
+            f"{file}: the {len(faces)} triangles in f have an area of {area:.3g} square metres, "
+            "expected a surface"
+        )
+
+
+def _check_regressor(file: Path, regressor: np.ndarray, tree: KinematicTree) -> None:
+    total = regressor.sum(1, dtype=np.float64)
+    joint = int(np.abs(total - 1).argmax())
+    if abs(total[joint] - 1) > _REGRESSED:
+        raise ValueError(
+            f"{file}: row {joint} of J_regressor ({tree.names[joint]}) sums to "
+            f"{total[joint]:.4g}, expected 1: a joint is a weighted mean of vertices"
+        )
+
+
 def _weights(file: Path, data: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
-    """Skinning weights; rows that do not sum to one, as rounded ones may not, are made to."""
+    """Skinning weights. Rows that do not sum to one, as in rounded files, are normalised."""
     weights = _array(file, data, "weights", shape)
     total = weights.sum(1, dtype=np.float64)
     bad = (total <= 0) | (weights.min(1, initial=0) < -_ROUNDED)
     if bad.any():
         raise ValueError(
-            f"{file}: weights of {bad.sum()} vertices are negative or all zero, the first those of "
-            f"vertex {int(np.argmax(bad))}; each row is shares of one"
+            f"{file}: weights of {bad.sum()} vertices are negative or all zero, first at "
+            f"vertex {int(np.argmax(bad))}; expected rows that sum to one"
         )
     off = np.abs(total - 1) > _ROUNDED
     if not off.any():
         return weights
     warnings.warn(
         f"{file}: weights of {off.sum()} vertices do not sum to one ({total.min():.3f} to "
-        f"{total.max():.3f}); they have been divided by their sum",
+        f"{total.max():.3f}); they were normalised",
         stacklevel=2,
     )
     return weights / total[:, None]
-
-
-def _dense(value: Any) -> Any:
-    return value.toarray() if hasattr(value, "toarray") else value
 
 
 def _tree(file: Path, data: dict[str, Any], parents: np.ndarray) -> tuple[KinematicTree, str]:
@@ -221,7 +256,7 @@ def _tree(file: Path, data: dict[str, Any], parents: np.ndarray) -> tuple[Kinema
     parents = parents.copy()
     parents[0] = -1  # stored as an unsigned -1
     found = tuple(int(p) for p in parents)
-    side = "left" if "left" in file.stem.lower() else "right"
+    side = "left" if any("left" in words for words in _words(file)) else "right"
     known = {"smpl": SMPL_TREE, "smplh": SMPLH_TREE, "smplx": SMPLX_TREE, "mano": mano_tree(side)}
     for kind, tree in known.items():
         if tree.parents == found:
@@ -233,23 +268,29 @@ def _tree(file: Path, data: dict[str, Any], parents: np.ndarray) -> tuple[Kinema
 
 
 def _names(joint2num: Any, count: int) -> tuple[str, ...]:
-    if isinstance(joint2num, dict) and sorted(map(int, joint2num.values())) == list(range(count)):
-        return tuple(str(n) for n, _ in sorted(joint2num.items(), key=lambda item: int(item[1])))
+    if isinstance(joint2num, dict) and all(np.size(value) == 1 for value in joint2num.values()):
+        number = {int(np.asarray(value).item()): str(name) for name, value in joint2num.items()}
+        if sorted(number) == list(range(count)):
+            return tuple(number[j] for j in range(count))
     return tuple(f"joint{j}" for j in range(count))
 
 
 def _split_shape(
-    directions: np.ndarray,
-    kind: str,
-    num_betas: int | None,
-    num_expression: int | None,
-    file: Path,
+    directions: np.ndarray, kind: str, num_betas: int | None, num_expression: int | None, file: Path
 ) -> tuple[np.ndarray, np.ndarray]:
     columns = directions.shape[-1]
-    if kind != "smplx":
-        split = columns
-    else:
-        split = _SHAPE_SPACE if columns > _SHAPE_SPACE else _OLD_SHAPE_SPACE
+    split = columns
+    if kind == "smplx" and columns > _SHAPE_SPACE:
+        split = _SHAPE_SPACE
+    elif kind == "smplx" and columns <= 2 * _OLD_SHAPE_SPACE:
+        split = _OLD_SHAPE_SPACE
+    elif kind == "smplx" and num_expression != 0:
+        warnings.warn(
+            f"{file}: shapedirs has {columns} columns, expected 400 or 20 (shape and expression); "
+            f"they are read as {columns} shape directions without expression. Pass "
+            "num_expression=0 to confirm",
+            stacklevel=4,
+        )
     shape, expression = directions[..., :split], directions[..., split:]
     for name, wanted, have in (
         ("num_betas", num_betas, shape.shape[-1]),
@@ -263,7 +304,7 @@ def _split_shape(
 def _hands(
     file: Path, data: dict[str, Any], tree: KinematicTree
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Mean hand by joint and PCA components by side, where the file has them."""
+    """Mean hand by joint and PCA components by side, if the file has them."""
     mean = np.zeros((tree.num_joints, 3))
     components: dict[str, np.ndarray] = {}
     groups = pose_groups(tree)
@@ -283,8 +324,18 @@ def _hands(
 
 
 def _gender(file: Path, default: str) -> str:
-    words = file.stem.lower().replace("-", "_").split("_")
-    for gender in ("neutral", "female", "male"):
-        if gender in words:
-            return gender
+    """The gender in the name of the file or else of its folder."""
+    letters = {gender[0]: gender for gender in _GENDERS}
+    for words in _words(file):
+        for word in words:
+            if word in _GENDERS:
+                return word
+        if words[0] == "basicmodel" and words[1:2] and words[1] in letters:
+            return letters[words[1]]
     return default
+
+
+def _words(file: Path) -> list[list[str]]:
+    """Words of the names of a file and of its folder, in lower case."""
+    names = (file.stem, file.absolute().parent.name)
+    return [name.lower().replace("-", "_").split("_") for name in names]

@@ -1,4 +1,4 @@
-"""The body model: blend shapes, joint regression and skinning, as pure functions of one frame."""
+"""Blend shapes, joint regression and skinning of a body, as pure functions of one frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from ..kinematics import (
     KinematicTree,
@@ -20,14 +20,16 @@ from ..kinematics import (
     skin_points,
 )
 from .params import BodyParams
+from .parts import Parts
 
-# Posing is geometry: products with ten-bit mantissas would move vertices by millimetres.
+# Products with ten-bit mantissas move vertices by millimetres.
 _PRECISION = jax.lax.Precision.HIGHEST
+_CHUNK = 1 << 20  # numbers hashed at once; the directions of a body have tens of millions
 
 
 @dataclass(frozen=True)
 class BodySource:
-    """Where a body came from: what an avatar file keeps in place of licensed arrays."""
+    """Origin of a body. Avatar files store this instead of licensed arrays."""
 
     path: str
     kind: str
@@ -40,10 +42,9 @@ class BodySource:
 
 
 class BodyModel(eqx.Module):
-    """A template mesh with blend shapes on a kinematic tree. Metres; the template's own axes.
+    """A template mesh with blend shapes on a kinematic tree, in metres and the template's axes.
 
-    The joint regressor is applied to the template and to the shape directions once, so that
-    joints cost J rows instead of V.
+    `joint_*` are the regressed joints of the template and its directions, precomputed.
     """
 
     template: Float[Array, "V 3"]
@@ -56,7 +57,7 @@ class BodyModel(eqx.Module):
     joint_shape_dirs: Float[Array, "J 3 S"]
     joint_expression_dirs: Float[Array, "J 3 E"]
     weights: Float[Array, "V J"]
-    part_labels: Int[np.ndarray, " V"]
+    parts: Parts
     colors: Int[np.ndarray, "V 3"] | None
     hand_mean: Float[Array, "J 3"]
     hand_components: dict[str, Float[np.ndarray, "n m"]]
@@ -67,6 +68,11 @@ class BodyModel(eqx.Module):
     def kind(self) -> str:
         """One of "smplx", "smplh", "smpl", "mano" and "other"."""
         return self.source.kind
+
+    @property
+    def part_labels(self) -> Int[np.ndarray | Array, " V"]:
+        """Part label of each vertex: `parts.labels`."""
+        return self.parts.labels
 
     @property
     def num_vertices(self) -> int:
@@ -96,14 +102,69 @@ class Posed(NamedTuple):
     joints: Float[Array, "J 3"]
 
 
+def make_body(
+    *,
+    template: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    joint_regressor: Float[np.ndarray, "J V"],
+    weights: Float[np.ndarray, "V J"],
+    parts: Parts,
+    tree: KinematicTree,
+    source: BodySource,
+    shape_dirs: Float[np.ndarray, "V 3 S"] | None = None,
+    expression_dirs: Float[np.ndarray, "V 3 E"] | None = None,
+    pose_dirs: Float[np.ndarray, "V 3 P"] | None = None,
+    joints: Float[np.ndarray, "J 3"] | None = None,
+    hand_mean: Float[np.ndarray, "J 3"] | None = None,
+    hand_components: dict[str, Float[np.ndarray, "n m"]] | None = None,
+    colors: Int[np.ndarray, "V 3"] | None = None,
+) -> BodyModel:
+    """Build a body from NumPy arrays, in JAX's default float type. Directions default to none.
+
+    Joints are regressed in float64, since a row of the regressor sums over thousands of vertices;
+    `joints` replaces those of the template.
+    """
+    bones = tree.num_joints
+    none = np.zeros((len(template), 3, 0))
+    shape_dirs = none if shape_dirs is None else shape_dirs
+    expression_dirs = none if expression_dirs is None else expression_dirs
+    if pose_dirs is None:
+        pose_dirs = np.zeros((len(template), 3, 9 * (bones - 1)))
+
+    def regress(values: np.ndarray) -> np.ndarray:
+        return np.tensordot(joint_regressor.astype(np.float64), values.astype(np.float64), axes=1)
+
+    def cast(value: np.ndarray) -> Array:
+        return jnp.asarray(value, float)
+
+    return BodyModel(
+        template=cast(template),
+        faces=faces,
+        shape_dirs=cast(shape_dirs),
+        expression_dirs=cast(expression_dirs),
+        pose_dirs=cast(pose_dirs),
+        joint_regressor=cast(joint_regressor),
+        joint_template=cast(regress(template) if joints is None else joints),
+        joint_shape_dirs=cast(regress(shape_dirs)),
+        joint_expression_dirs=cast(regress(expression_dirs)),
+        weights=cast(weights),
+        parts=parts,
+        colors=colors,
+        hand_mean=cast(np.zeros((bones, 3)) if hand_mean is None else hand_mean),
+        hand_components=hand_components or {},
+        tree=tree,
+        source=source,
+    )
+
+
 def rest_joints(
     body: BodyModel, betas: Float[Array, " S"], expression: Float[Array, " E"] | None = None
 ) -> Float[Array, "J 3"]:
     """Joints of the unposed body of this shape (and expression), metres."""
     joints = body.joint_template + _combine(body.joint_shape_dirs, betas)
-    if expression is not None:
-        joints = joints + _combine(body.joint_expression_dirs, expression)
-    return joints
+    if expression is None:
+        return joints
+    return joints + _combine(body.joint_expression_dirs, expression)
 
 
 def rest_vertices(
@@ -111,18 +172,18 @@ def rest_vertices(
 ) -> Float[Array, "V 3"]:
     """Vertices of the unposed body of this shape (and expression), metres."""
     vertices = body.template + _combine(body.shape_dirs, betas)
-    if expression is not None:
-        vertices = vertices + _combine(body.expression_dirs, expression)
-    return vertices
+    if expression is None:
+        return vertices
+    return vertices + _combine(body.expression_dirs, expression)
 
 
-# Compiled as wholes, here and below: step by step, a first call would compile a hundred programs.
+# Jitted here and below: otherwise the first call compiles a hundred small programs.
 @eqx.filter_jit
 def pose_body(body: BodyModel, params: BodyParams) -> Posed:
     """Pose one frame; `jax.vmap(partial(pose_body, body))` poses many.
 
     Shape, expression and pose blend shapes, then linear blend skinning (SMPL-X: Pavlakos et al.,
-    CVPR 2019). Differentiable in every parameter, at zero rotation too.
+    CVPR 2019). Differentiable in every parameter, including at zero rotation.
 
     **Raises:** `ValueError` when tracing if the parameters do not fit the body.
     """
@@ -144,11 +205,11 @@ def pose_offsets(body: BodyModel, rotations: Float[Array, "J 3 3"]) -> Float[Arr
 
 
 def canonical_pose(body: BodyModel) -> Float[Array, "J 3"]:
-    """The pose of canonical space: legs apart, mouth a little open, hands flat.
+    """The pose of canonical space: legs apart, mouth slightly open, hands flat.
 
     Hips turn by 30 degrees about z and the jaw by 0.2 rad about x (X-Avatar's released code).
-    A tree without these joints, or a body outside the SMPL family, whose axes may differ, keeps
-    its rest pose.
+    Missing joints are skipped. A body outside the SMPL family, whose axes may differ, keeps its
+    rest pose.
     """
     pose = np.zeros((body.num_joints, 3))
     if body.kind != "other":
@@ -184,9 +245,9 @@ def canonical_joints(body: BodyModel, betas: Float[Array, " S"]) -> Float[Array,
 
 @eqx.filter_jit
 def canonical_expression_dirs(body: BodyModel) -> Float[Array, "V 3 E"]:
-    """Where each coefficient of expression moves a vertex in the canonical pose, metres.
+    """Expression blend shapes in the canonical pose, metres per coefficient.
 
-    The directions turn with the bones; joints stay, as in `bone_transforms`.
+    The directions turn with the bones; joints do not move, as in `bone_transforms`.
     """
     rotations = relative_transforms(
         body.tree, axis_angle_to_matrix(canonical_pose(body)), body.joint_template
@@ -197,7 +258,7 @@ def canonical_expression_dirs(body: BodyModel) -> Float[Array, "V 3 E"]:
 
 @eqx.filter_jit
 def bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "J 4 4"]:
-    """Transforms of every bone from canonical space to one posed frame, translation included.
+    """Transforms of all bones from canonical space to one posed frame, translation included.
 
     $B_i = A_i(\\theta) A_i(\\theta_{cano})^{-1}$ with the canonical body of the same shape and no
     expression (X-Avatar, section 3). Use `jax.vmap` over a batch of parameters.
@@ -218,24 +279,41 @@ def bone_transforms(body: BodyModel, params: BodyParams) -> Float[Array, "J 4 4"
 
 
 def with_template(body: BodyModel, vertices: Float[np.ndarray, "V 3"]) -> BodyModel:
-    """The same body with a subject's own template (GRAB's `vtemp`), its joints regressed from it.
+    """The same body with a person's template (GRAB's `vtemp`) and joints regressed from it.
 
-    Shape coefficients stay, as offsets from the new template: pass zero betas for the subject.
+    Shape coefficients become offsets from the new template: pass zero betas for the person.
 
     **Raises:** `ValueError` if the vertex count differs.
     """
     if vertices.shape != body.template.shape:
         raise ValueError(
             f"the template has shape {vertices.shape}, expected {body.template.shape}: "
-            "it must have the body's own topology"
+            "it must have the topology of the body"
         )
     template = jnp.asarray(vertices, body.template.dtype)
     joints = jnp.matmul(body.joint_regressor, template, precision=_PRECISION)
-    # Another template is another body: an avatar learned on it must not load on the plain model.
+    # A different checksum: an avatar trained on this body must not load on the original one.
     digest = hashlib.sha256(body.source.checksum.encode())
     digest.update(np.ascontiguousarray(vertices, np.float32).tobytes())
     source = replace(body.source, checksum=digest.hexdigest())
     return replace(body, template=template, joint_template=joints, source=source)
+
+
+def body_checksum(
+    tree: KinematicTree, faces: Int[np.ndarray, "F 3"], *arrays: Shaped[np.ndarray, "..."]
+) -> str:
+    """SHA-256 of a tree, faces and arrays to six decimals, as hexadecimal digits.
+
+    Independent of the file format and of how a processor rounds.
+    """
+    digest = hashlib.sha256(repr((tree.names, tree.parents)).encode())
+    digest.update(np.ascontiguousarray(faces, np.int32).tobytes())
+    for array in arrays:
+        flat = np.ascontiguousarray(array).reshape(-1)
+        for start in range(0, len(flat), _CHUNK):
+            chunk = flat[start : start + _CHUNK].astype(np.float64)
+            digest.update(np.rint(chunk * 1e6).astype(np.int64).tobytes())
+    return digest.hexdigest()
 
 
 def _combine(

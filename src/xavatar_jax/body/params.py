@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -11,14 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ..kinematics import KinematicTree
+from ..kinematics import TO_Y_UP, KinematicTree
 from .joints import pose_groups
 
 MAX_DEFAULT_COEFFICIENTS = 10
+Side = Literal["left", "right"]
 
 
 class BodyParams(eqx.Module):
-    """Pose, shape, expression and place of a body, for one frame or a batch of them.
+    """Pose, shape, expression and translation of a body, for one frame or a batch of frames.
 
     - `pose`: axis-angle of every joint relative to its parent, radians, `(..., J, 3)`. Hands are
       absolute: zero is the flat hand of the template, not the mean hand.
@@ -49,10 +50,10 @@ class BodyParams(eqx.Module):
         expression: Any = None,
         transl: Any = None,
     ) -> BodyParams:
-        """Parameters by SMPL-X's names; what is not given is zero.
+        """Create parameters by SMPL-X's names; the default of each is zero.
 
-        Each pose may be given flat, `(..., 3 n)`, or by joint, `(..., n, 3)`; leading batch axes
-        broadcast against one another. `pose` sets all joints at once and excludes the others.
+        Poses are flat, `(..., 3 n)`, or by joint, `(..., n, 3)`; leading batch axes broadcast.
+        `pose` sets all joints at once and excludes the other poses.
 
         **Raises:** `ValueError` naming the argument, its shape and the one expected, or the joints
         that the body lacks.
@@ -67,33 +68,29 @@ class BodyParams(eqx.Module):
             "leye_pose": leye_pose,
             "reye_pose": reye_pose,
         }
+        given = {name: value for name, value in given.items() if value is not None}
         groups = pose_groups(tree)
         parts: dict[tuple[int, ...], Array] = {}
         if pose is not None:
-            named = [name for name, value in given.items() if value is not None]
-            if named:
-                raise ValueError(f"pose sets every joint already: leave out {', '.join(named)}")
+            if given:
+                raise ValueError(f"pose already sets every joint: leave out {', '.join(given)}")
             parts[tuple(range(tree.num_joints))] = _joints("pose", pose, tree.num_joints)
-        else:
-            for name, value in given.items():
-                if value is None:
-                    continue
-                if not groups[name]:
-                    raise ValueError(f"{name} was given, but the body's tree has no such joints")
-                parts[groups[name]] = _joints(name, value, len(groups[name]))
-        coefficients = {
-            "betas": _vector("betas", betas, min(MAX_DEFAULT_COEFFICIENTS, body.num_betas)),
-            "expression": _vector(
-                "expression", expression, min(MAX_DEFAULT_COEFFICIENTS, body.num_expression)
-            ),
-            "transl": _vector("transl", transl, 3),
-        }
-        for name, limit in (("betas", body.num_betas), ("expression", body.num_expression)):
-            if coefficients[name].shape[-1] > limit:
+        for name, value in given.items():
+            if not groups[name]:
+                raise ValueError(f"{name} was given, but the body's tree has no such joints")
+            parts[groups[name]] = _joints(name, value, len(groups[name]))
+        coefficients = {"transl": _vector("transl", transl, 3)}
+        for name, value, limit in (
+            ("betas", betas, body.num_betas),
+            ("expression", expression, body.num_expression),
+        ):
+            found = _vector(name, value, min(MAX_DEFAULT_COEFFICIENTS, limit))
+            if found.shape[-1] > limit:
                 raise ValueError(
-                    f"{name} has {coefficients[name].shape[-1]} coefficients, but the body "
+                    f"{name} has {found.shape[-1]} coefficients, but the body "
                     f"({body.source.describe()}) has {limit}: truncate it or load another model"
                 )
+            coefficients[name] = found
         if coefficients["transl"].shape[-1] != 3:
             raise ValueError(f"transl has shape {coefficients['transl'].shape}, expected (..., 3)")
         batch = jnp.broadcast_shapes(
@@ -117,12 +114,12 @@ class BodyParams(eqx.Module):
     def __getitem__(self, index: Any) -> BodyParams:
         """Index or slice the leading batch axis."""
         if self.pose.ndim == 2:
-            raise IndexError("these parameters are of a single frame: there is no batch to index")
+            raise IndexError("parameters of a single frame have no batch axis to index")
         return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __len__(self) -> int:
         if self.pose.ndim == 2:
-            raise TypeError("these parameters are of a single frame and have no length")
+            raise TypeError("parameters of a single frame have no length")
         return self.pose.shape[0]
 
     @property
@@ -140,7 +137,7 @@ class BodyParams(eqx.Module):
 
     @property
     def body_pose(self) -> Float[Array, "*batch n 3"]:
-        """Rotations of all joints that belong to no other name, `(..., 21, 3)` in SMPL-X."""
+        """Rotations of the joints of no other group, `(..., 21, 3)` in SMPL-X."""
         return self._view("body_pose")
 
     @property
@@ -170,9 +167,9 @@ class BodyParams(eqx.Module):
 
 
 def check_params(body: Any, params: BodyParams, *, what: str = "params") -> None:
-    """Check concrete parameters against a body, for code that reads them from outside.
+    """Check concrete parameters from outside the library against a body.
 
-    **Raises:** `ValueError` naming the field and, for a batch, the first frame that is wrong.
+    **Raises:** `ValueError` naming the field and, for a batch, the first invalid frame.
     """
     if params.tree.parents != body.tree.parents:
         raise ValueError(
@@ -192,30 +189,83 @@ def check_params(body: Any, params: BodyParams, *, what: str = "params") -> None
             frame = f", frame {where[0]}" if params.pose.ndim > 2 else ""
             raise ValueError(
                 f"{what}.{name}{frame} is not finite (entry {tuple(int(i) for i in where)}): "
-                "remove or mend that frame"
+                "remove or correct that frame"
             )
 
 
 def with_betas(params: BodyParams, betas: ArrayLike) -> BodyParams:
-    """The same parameters with one shape `(S,)` for all of them in place of theirs."""
+    """The same parameters with the shape `(S,)` in every frame."""
     shape = jnp.asarray(betas, params.pose.dtype)
     shapes = jnp.broadcast_to(shape, (*params.pose.shape[:-2], len(shape)))
     return eqx.tree_at(lambda p: p.betas, params, shapes)
 
 
+def root_rotation(params: BodyParams) -> Float[np.ndarray, "3 3"]:
+    """Orientation of the root in the world, for one frame."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.array(params.pose[0], np.float64)).as_matrix()
+
+
+def facing(params: BodyParams, up: str = "y") -> Float[np.ndarray, "3"]:
+    """Horizontal direction that the person of one frame faces: the root's rotation of +Z."""
+    to_y_up = TO_Y_UP[up]
+    ahead, vertical = root_rotation(params)[:, 2], to_y_up[1]
+    ahead = ahead - (ahead @ vertical) * vertical
+    length = float(np.linalg.norm(ahead))
+    if length < 1e-3:
+        return to_y_up.T @ np.array([0.0, 0.0, 1.0])
+    return ahead / length
+
+
+def hands_to_absolute(body: Any, hand_pose: Any, side: Side) -> Float[Array, "*batch n 3"]:
+    """Convert a hand pose relative to the mean hand (`flat_hand_mean=False`) to an absolute one.
+
+    `hand_pose` is `(..., 45)`, `(..., 15, 3)` or PCA coefficients `(..., 6 | 12 | 24)`, which are
+    expanded with the model's components.
+
+    **Raises:** `ValueError` if the body has no such hand, or no components for PCA coefficients.
+    """
+    joints = _hand_joints(body, side)
+    pose = jnp.asarray(hand_pose, body.template.dtype)
+    if pose.shape[-2:] != (len(joints), 3):
+        count = pose.shape[-1]
+        if count != 3 * len(joints):
+            components = body.hand_components.get(side)
+            if components is None or count > len(components):
+                have = "none" if components is None else str(len(components))
+                raise ValueError(
+                    f"{side}_hand_pose has {count} numbers, which is neither a full pose nor PCA "
+                    f"coefficients of this body ({have} components)"
+                )
+            pose = pose @ jnp.asarray(components[:count], pose.dtype)
+        pose = pose.reshape(*pose.shape[:-1], len(joints), 3)
+    return pose + body.hand_mean[joints]
+
+
+def hands_to_relative(
+    body: Any, hand_pose: Float[Array, "*batch n 3"], side: Side
+) -> Float[Array, "*batch n 3"]:
+    """Convert an absolute hand pose to one relative to the mean hand, as many files store it."""
+    return hand_pose - body.hand_mean[_hand_joints(body, side)]
+
+
+def _hand_joints(body: Any, side: Side) -> np.ndarray:
+    joints = pose_groups(body.tree)[f"{side}_hand_pose"]
+    if not joints:
+        raise ValueError(f"the body ({body.source.describe()}) has no {side} hand joints")
+    return np.asarray(joints)
+
+
 def _joints(name: str, value: Any, count: int) -> Array:
     array = jnp.asarray(value, dtype=float)
-    if (
-        array.ndim >= 1
-        and array.shape[-1] == 3 * count
-        and not (array.ndim >= 2 and array.shape[-2:] == (count, 3))
-    ):
-        array = array.reshape(*array.shape[:-1], count, 3)
-    if array.ndim < 2 or array.shape[-2:] != (count, 3):
-        raise ValueError(
-            f"{name} has shape {array.shape}, expected (..., {3 * count}) or (..., {count}, 3)"
-        )
-    return array
+    if array.shape[-2:] == (count, 3):
+        return array
+    if array.ndim and array.shape[-1] == 3 * count:
+        return array.reshape(*array.shape[:-1], count, 3)
+    raise ValueError(
+        f"{name} has shape {array.shape}, expected (..., {3 * count}) or (..., {count}, 3)"
+    )
 
 
 def _vector(name: str, value: Any, default: int) -> Array:

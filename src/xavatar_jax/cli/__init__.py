@@ -1,8 +1,8 @@
 """The `xavatar` command.
 
-A subcommand is one module of this package with a dataclass `Options`, which is its command line,
-and `run(options)`, which imports what it needs; and one line in `COMMANDS`. It may have
-`parse(arguments, prog, description)` if its options alone do not say how to read its command line.
+Each subcommand is a module of this package with a dataclass `Options`, which defines its command
+line, and a function `run(options)`, which imports what it needs. `COMMANDS` lists the subcommands.
+A module may also define `parse(arguments, prog, description)` to parse its own command line.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 from .._version import __version__
 
 COMMANDS = {
-    "fit": "learn an avatar from posed meshes, and test it",
-    "evaluate": "compare an avatar with meshes it has not seen",
-    "animate": "pictures of an avatar that follows a motion",
-    "export": "rigged GLB, meshes, sequences of meshes, skinning weights",
-    "view": "an avatar in the browser, or one page that plays anywhere",
-    "convert": "a motion from one file format to another",
-    "info": "this machine, or what is in a file",
+    "fit": "fit an avatar to posed meshes and evaluate it on held-out frames",
+    "evaluate": "compare an avatar with the held-out meshes of a capture",
+    "animate": "render an avatar that follows a motion",
+    "export": "write an avatar for other programs: rigged GLB, meshes, skinning weights",
+    "view": "show an avatar in the browser, or write a self-contained HTML page",
+    "convert": "convert a motion to another file format",
+    "info": "describe this machine, or the contents of a file",
 }
 _HELP = """\
 usage: xavatar COMMAND ...
@@ -32,22 +32,20 @@ Animatable avatars of one person: body, hands and face.
 
 xavatar COMMAND --help    options of a command
 xavatar --version         version
---debug                   after any command: show where an error comes from
+--debug                   traceback of errors (after any command)
 
-Try it without any data:
+To try it without any data:
   xavatar fit --minutes 2
   xavatar animate out/fit_grab/avatar.npz bundled --out out/animation.webp
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line, by default that of the process. Returns its exit code.
+    """Run a command line, by default that of the process, and return its exit code.
 
-    0: done; 1: the run failed; 2: the input is wrong; 130: Ctrl-C, 143: SIGTERM.
+    0: success; 1: the run failed; 2: invalid input; 130: Ctrl-C; 143: SIGTERM.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
+    words, debug = _without_debug(arguments)
     if not words or words[0] in ("-h", "--help", "help"):
         print(help_text(), end="", file=sys.stdout if words else sys.stderr)
         return 0 if words else 2
@@ -62,9 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}."
         print(f"error: no command {name!r}; {hint}", file=sys.stderr)
         return 2
-    return run_command(
-        import_module(f".{name}", __name__), words[1:], prog=f"xavatar {name}", debug=debug
-    )
+    command = import_module(f".{name}", __name__)
+    return run_command(command, words[1:], prog=f"xavatar {name}", debug=debug)
 
 
 def run_command(
@@ -75,32 +72,34 @@ def run_command(
     description: str | None = None,
     debug: bool = False,
 ) -> int:
-    """Run the module of one subcommand, by default with the arguments of the process.
+    """Run a subcommand's module, by default with the arguments of the process.
 
-    With `debug`, or `--debug` among the arguments, errors come with their traceback.
+    With `debug`, or `--debug` among the arguments, errors are raised with their traceback.
     """
     from .failures import exit_code, notices_as_lines
     from .options import parse, spoken_names
 
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    debug |= "--debug" in words
-    words = [word for word in words if word != "--debug"]
+    words, asked = _without_debug(arguments)
+    spoken = spoken_names(command)
 
     def run() -> None:
-        own_parse = getattr(command, "parse", None)
-        if own_parse is not None:
-            options = own_parse(words, prog, description)
+        if hasattr(command, "parse"):
+            options = command.parse(words, prog, description)
         else:
             options = parse(command.Options, words, prog, description)
         with notices_as_lines(spoken):
             command.run(options)
 
-    spoken = spoken_names(command)
-    return exit_code(run, spoken=spoken, debug=debug)
+    return exit_code(run, spoken=spoken, debug=debug or asked)
 
 
 def help_text() -> str:
-    """What `xavatar --help` prints."""
+    """The output of `xavatar --help`."""
     width = max(map(len, COMMANDS))
     lines = [f"  {name:{width}}  {summary}" for name, summary in COMMANDS.items()]
     return _HELP.format(commands="\n".join(lines))
+
+
+def _without_debug(arguments: Sequence[str] | None) -> tuple[list[str], bool]:
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    return [word for word in words if word != "--debug"], "--debug" in words

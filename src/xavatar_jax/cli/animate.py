@@ -9,61 +9,60 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from .inputs import read_avatar, read_stretch
-from .options import READING_NAMES, Driven, Number, Target, arg
-from .outputs import check_file, check_new_folder, written
+from .files import check_output, read_avatar, read_driven, written
+from .options import Driven, Number, Target, arg
 
-_FASTEST = 30.0  # more frames a second than this make files large and nothing better
-SPOKEN = READING_NAMES
+_FASTEST = 30.0  # frames per second: a higher rate only makes files larger
 
 
 @dataclass
 class Options(Driven):
-    """Draw an avatar that follows a motion.
+    """Render an avatar that follows a motion. No display is needed.
 
-    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of ours.
-
-    No display is needed.
+    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of the library.
     """
 
     avatar: Positional[Path]
-    """Avatar file, as `xavatar fit` writes it."""
+    """Avatar file written by `xavatar fit`."""
     motion: Positional[Path]
-    """What it is to do."""
+    """Motion to follow."""
     out: Target
-    """FILE.webp, FILE.gif, or a new folder for one PNG a frame."""
+    """Output: FILE.webp, FILE.gif, or a new folder for one PNG per frame."""
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (512, 512)
-    """Of the pictures, in pixels."""
+    """Image size in pixels."""
     view: Literal["front", "three_quarter", "left", "back", "right"] = "front"
-    """Where to look from."""
+    """Side of the avatar that the camera sees."""
     shading: Literal["color", "normal", "flat"] = "color"
-    """color: lit, with a shadow on the ground."""
+    """Shading of the surface. color: lit, with a shadow on the ground."""
     mode: Literal["fast", "full"] = "fast"
-    """fast: skin the canonical surface. full: extract every frame's own; slow."""
+    """fast: skin the canonical surface. full: extract the surface of each frame; slow."""
     offsets: Literal["cached", "exact", "none"] = "cached"
     """How the surface follows pose and expression in fast mode."""
     fps: Number = field(default=None, kw_only=True)
-    """Frames a second; without it the motion's own, 30 at most."""
+    """Frames per second (default: those of the motion, at most 30)."""
 
 
 def run(options: Options) -> None:
     """Draw every frame and write the pictures."""
+    from ..learning import progress
     from ..report import motion_pictures
-    from ..training.progress import progress
 
     write = _writer(options.out)
     if min(options.size) < 1:
-        raise ValueError(f"--size {options.size[0]} {options.size[1]}: at least one pixel a side")
+        raise ValueError(
+            f"--size {options.size[0]} {options.size[1]}: width and height must be at least one "
+            "pixel"
+        )
     avatar = read_avatar(options.avatar, options.body, options.template)
-    motion = read_stretch(options.motion, options, avatar.body, fastest=_FASTEST)
+    motion = read_driven(options.motion, options, avatar.body, fastest=_FASTEST)
     animation = avatar.animate(motion, mode=options.mode, offsets=options.offsets)
     pictures = motion_pictures(
         animation, size=options.size, view=options.view, shading=options.shading
     )
     with progress("pictures", len(animation), verbose=not options.quiet, unit="frame") as bar:
         write(_counted(pictures, bar), options.out, animation.fps)
-    told = f"{len(animation)} frames, {animation.fps:g} a second"
-    written(options.out, told, quiet=options.quiet)
+    what = f"{len(animation)} frames, {animation.fps:g} per second"
+    written(options.out, what, quiet=options.quiet)
 
 
 def _counted(pictures: Iterable[Any], bar: Any) -> Iterable[Any]:
@@ -73,7 +72,7 @@ def _counted(pictures: Iterable[Any], bar: Any) -> Iterable[Any]:
 
 
 def _writer(out: Path) -> Any:
-    """The function that writes pictures to `out`, chosen by its name."""
+    """The function that writes pictures to `out`, chosen by its suffix."""
     from ..render import save_gif_animation, save_webp_animation
 
     suffix = out.suffix.lower()
@@ -83,15 +82,12 @@ def _writer(out: Path) -> Any:
         "": _save_folder,
     }
     if suffix not in writers:
+        ffmpeg = ". Use ffmpeg to make a film of a folder: docs/command-line.md"
         raise ValueError(
-            f"{out}: pictures are written to .webp, .gif or a folder of PNG files, not to {suffix}"
-            + (
-                ". ffmpeg makes a film of a folder: docs/command-line.md"
-                if suffix == ".mp4"
-                else ""
-            )
+            f"{out}: pictures can be written to .webp, .gif or a folder of PNG files, not to "
+            f"{suffix}{ffmpeg if suffix == '.mp4' else ''}"
         )
-    (check_file if suffix else check_new_folder)(out)
+    check_output(out, "file" if suffix else "new folder")
     return writers[suffix]
 
 

@@ -10,71 +10,67 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 import xavatar_jax as xa
 
-from .inputs import cut_motion, read_body, read_motion
-from .options import READING_NAMES, Count, File, Flag, Gender, Number, Reading, Seconds, Target, arg
-from .outputs import check_file, check_new_folder, written
+from .files import check_frame, check_output, cut_motion, read_body, read_motion, written
+from .options import Count, File, Flag, Gender, Number, Reading, Seconds, Target, arg
 
-SPOKEN = {**READING_NAMES, "format": "--read-as for MOTION, --format for --out"}
+SPOKEN = {"format": "--read-as for MOTION, --format for --out"}
 
 
 @dataclass
 class Options:
-    """Write a motion in another file format. The name of --out says which:
+    """Convert a motion to another file format, which follows from the name of --out:
 
-      FILE.npz  AMASS, which Blender's SMPL-X add-on takes; z up
+      FILE.npz  AMASS, which Blender's SMPL-X add-on imports; z up
       FILE.bvh  BVH; y up
       FILE.npy  pose vectors of X-Avatar's code; y up
-      FOLDER    a pose pickle a frame, as of X-Humans; y up
+      FOLDER    one pose pickle per frame, as in X-Humans; y up
       FILE.pkl  one pose pickle, of --frame; y up
 
-    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of ours.
+    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of the library.
 
-    What a format cannot hold is said.
+    Losses of the conversion are reported.
     """
 
     motion: Positional[Path]
-    """What to read."""
+    """Motion to read."""
     out: Target = field(kw_only=True)
-    """File or folder to write: see above."""
+    """Output file or folder; see above."""
     format: Annotated[
         Literal["amass", "bvh", "poses", "xavatar"] | None,
         arg(metavar="{amass,bvh,poses,xavatar}", help_behavior_hint=""),
     ] = None
-    """Format to write, whatever the name of --out."""
+    """Output format, regardless of the name of --out."""
     body: File = None
-    """The body that moves ("bundled": our own). All but AMASS to AMASS need it."""
+    """Body of the motion ("bundled": the bundled body). Needed except from AMASS to AMASS."""
     gender: Gender = None
-    """Of the body, where --body is a folder of models."""
+    """Gender of the body, if --body is a folder of models."""
     fps: Number = None
-    """Frames a second afterwards."""
+    """Frames per second of the output."""
     start: Seconds = None
-    """Leave out what is before."""
+    """Start of the output within the motion."""
     end: Seconds = None
-    """Leave out what is after."""
+    """End of the output within the motion."""
     frame: Count = None
-    """Only this frame, from 0."""
+    """Number of the only frame to write, from 0."""
     smooth: Seconds = None
-    """Take out jitter faster than about this."""
+    """Time scale of the jitter to remove."""
     quiet: Flag = False
-    """Say nothing but errors and notices."""
+    """Print only errors and notices."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
 def run(options: Options) -> None:
-    """Read, change, write."""
+    """Read, edit and write the motion."""
     is_folder = options.out.suffix == "" and options.format in (None, "poses")
-    (check_new_folder if is_folder else check_file)(options.out)
+    check_output(options.out, "new folder" if is_folder else "file")
     body = None if options.body is None else read_body(options.body, options.gender)
     motion = read_motion(options.motion, options.reading, body)
     if options.smooth is not None:
         motion = motion.smooth(options.smooth)
     motion = cut_motion(motion, options.start, options.end, options.fps)
     if options.frame is not None:
-        if not 0 <= options.frame < len(motion):
-            raise ValueError(
-                f"--frame {options.frame}: {motion.source} has frames 0 to {len(motion) - 1}"
-            )
-        motion = motion[options.frame : options.frame + 1]
+        frame = check_frame(options.frame, motion)
+        motion = motion[frame : frame + 1]
     xa.save_motion(options.out, motion, format=options.format, body=body)
     frames = "1 frame" if len(motion) == 1 else f"{len(motion)} frames"
-    written(options.out, f"{frames}, {motion.fps:g} a second", quiet=options.quiet)
+    written(options.out, f"{frames}, {motion.fps:g} per second", quiet=options.quiet)

@@ -1,72 +1,56 @@
-"""`xavatar evaluate`: an avatar against meshes that it has not seen."""
+"""`xavatar evaluate`: an avatar compared with held-out meshes."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 import xavatar_jax as xa
 
-from .inputs import count_of, read_avatar_body, read_capture
-from .options import Count, File, Flag, Folder, Gender, Target, Truth, Words, arg
-from .outputs import check_file, written
+from .files import check_output, count_of, read_avatar_body, read_capture, written
+from .options import Count, Data, File, Flag, Target
 
 
 @dataclass
 class Options:
     """Compare an avatar with the held-out meshes of a capture: a table, and metrics.json.
 
-    The figures are explained in docs/benchmarks.md.
+    docs/benchmarks.md explains the metrics.
     """
 
     avatar: Positional[Path]
-    """Avatar file, as `xavatar fit` writes it."""
+    """Avatar file written by `xavatar fit`."""
     out: Target = Path("out/evaluate/metrics.json")
-    """Where to write the figures, as JSON."""
-    data: Folder = None
-    """A capture; without it the bundled one."""
-    test: Words = ()
-    """Its sequences to evaluate on, where it is not split already."""
-    flat_hand_mean: Truth = None
-    """Of meshes with parameters beside them. False: their hands are relative to the mean hand."""
-    eval_frames: Annotated[str, arg(metavar="N|all")] = "24"
-    """Held-out frames to evaluate, spread over the sequences."""
+    """Output file for the metrics, in JSON."""
     mode: Literal["fast", "full"] = "fast"
-    """fast: skin the canonical surface. full: extract every frame's own; slow."""
+    """fast: skin the canonical surface. full: extract the surface of each frame; slow."""
     body: File = None
-    """The body model, if it is not where the avatar was learned ("bundled": our own)."""
-    gender: Gender = None
-    """In place of the gender that the data name."""
+    """Body model, if it is not where the avatar was trained ("bundled": the bundled body)."""
     seed: Count = None
-    """Of the points that are compared, and of the split; without it that of the avatar's run."""
+    """Random seed of the compared points and of the split (default: that of the avatar's run)."""
     quiet: Flag = False
     """No progress bars, no table."""
+    capture: OmitArgPrefixes[Data] = field(default_factory=Data)
 
 
 def run(options: Options) -> None:
-    """Evaluate, write the figures, print the table."""
-    from ..avatar import load_avatar_config
+    """Evaluate, write the metrics, print the table."""
+    from ..avatar import load_avatar_header
     from ..report import metrics_record, metrics_table, write_json
 
     started = time.perf_counter()
-    count = count_of(options.eval_frames)
-    check_file(options.out)
-    seed = load_avatar_config(options.avatar).seed if options.seed is None else options.seed
+    count = count_of(options.capture.eval_frames)
+    check_output(options.out)
+    seed = options.seed
+    if seed is None:
+        seed = load_avatar_header(options.avatar).options.get("seed", 0)
     body = read_avatar_body(options.avatar, options.body)
-    capture = read_capture(
-        options.data,
-        body,
-        gender=options.gender,
-        test=options.test,
-        seed=seed,
-        flat_hand_mean=options.flat_hand_mean,
-        verbose=not options.quiet,
-    )
-    # A capture may have the person's own template: then that is the body that was learned on.
+    capture = read_capture(options.capture, body, seed=seed, verbose=not options.quiet)
+    # A capture may come with the person's own template, on which the avatar was then trained.
     avatar = xa.load_avatar(options.avatar, body=capture.body)
     evaluation = xa.evaluate(
         avatar,
@@ -76,12 +60,11 @@ def run(options: Options) -> None:
         seed=seed,
         verbose=not options.quiet,
     )
-    seconds = {"total": time.perf_counter() - started}
     record = metrics_record(
         evaluation,
         None,
         avatar,
-        seconds,
+        {"total": time.perf_counter() - started},
         data=capture.name,
         mode=options.mode,
         notices=list(capture.notices),

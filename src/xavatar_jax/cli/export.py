@@ -10,70 +10,69 @@ from tyro.conf import Positional
 
 import xavatar_jax as xa
 
-from .inputs import read_avatar, read_stretch
-from .options import (
-    READING_NAMES,
-    Count,
-    Driven,
-    OptionalPaths,
-    Target,
-)
-from .outputs import check_file, check_new_folder, written
+from .files import check_frame, check_output, read_avatar, read_driven, written
+from .options import Count, Driven, OptionalPaths, Target
 
 if TYPE_CHECKING:
-    from ..avatar import Avatar
+    from ..body import BodyModel
     from ..motion import Motion
-
-SPOKEN = READING_NAMES
 
 
 @dataclass
 class Options(Driven):
-    """Write an avatar for other programs. The name of --out says what:
+    """Write an avatar for other programs. The format follows from the name of --out:
 
-      FILE.glb            a rigged mesh, expressions as blend shapes, each MOTION a clip
+      FILE.glb            a rigged mesh, expressions as blend shapes, one clip per MOTION
       FILE.ply, FILE.obj  one mesh, in canonical pose or in a frame of MOTION
-      FOLDER              a mesh for every frame of MOTION, all with the same faces
+      FOLDER              one mesh per frame of MOTION, all with the same faces
       FILE.npz            skinning weights, skeleton and mesh as plain arrays
 
-    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of ours.
+    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of the library.
     """
 
     avatar: Positional[Path]
-    """Avatar file, as `xavatar fit` writes it."""
+    """Avatar file written by `xavatar fit`."""
     motion: OptionalPaths = ()
-    """What it is to do; several, one after another, for a GLB of several clips."""
+    """Motion to follow; a GLB takes several."""
     out: Target = field(kw_only=True)
-    """File or folder to write: see above."""
+    """Output file or folder; see above."""
     influences: Literal[4, 8] = 4
-    """GLB: bones a vertex. Blender reads eight, three.js the first four."""
+    """GLB: bones per vertex. Blender reads eight, three.js the first four."""
     expressions: Count = None
-    """GLB: coefficients of expression that get blend shapes; without it all."""
+    """GLB: number of expression coefficients exported as blend shapes (default: all)."""
     format: Literal["ply", "obj"] = "ply"
-    """FOLDER: kind of the mesh files."""
+    """FOLDER: format of the mesh files."""
     frame: Count = None
-    """FILE.ply, FILE.obj: which frame of MOTION, from 0."""
+    """FILE.ply, FILE.obj: number of the frame of MOTION, from 0."""
 
 
 def run(options: Options) -> None:
-    """Write what the name of the output asks for."""
+    """Write the output that the name of --out asks for."""
     suffix, count = options.out.suffix.lower(), len(options.motion)
     if suffix not in ("", ".glb", ".ply", ".obj", ".npz"):
         raise ValueError(
-            f"{options.out}: nothing is written to {suffix} files. Use .glb, .ply, .obj, .npz "
-            "(skinning weights) or a folder (a mesh for every frame)"
+            f"{options.out}: unknown format {suffix}. Use .glb, .ply, .obj, .npz (skinning "
+            "weights) or a folder (one mesh per frame)"
         )
     if suffix == ".npz" and count:
-        raise ValueError(f"{options.out}: skinning weights depend on no motion; leave out MOTION")
+        raise ValueError(
+            f"{options.out}: skinning weights do not depend on a motion; leave out MOTION"
+        )
     if (suffix in (".ply", ".obj") and count > 1) or (suffix == "" and count != 1):
-        raise ValueError(f"{options.out}: one MOTION is needed for it, {count} are given")
+        raise ValueError(f"{options.out}: this output needs one MOTION, found {count}")
     if options.frame is not None and (suffix not in (".ply", ".obj") or not count):
-        raise ValueError("--frame is for one mesh, FILE.ply or FILE.obj, of a MOTION")
-    (check_file if suffix else check_new_folder)(options.out)
+        raise ValueError("--frame applies to one mesh of a MOTION: --out FILE.ply or FILE.obj")
+    check_output(options.out, "file" if suffix else "new folder")
     avatar = read_avatar(options.avatar, options.body, options.template)
-    motions = _motions(options, avatar)
+    motions = _motions(options, avatar.body)
     if suffix == ".glb":
-        _write_glb(options, avatar, motions)
+        avatar.export_glb(
+            options.out,
+            motions or None,
+            influences=options.influences,
+            expressions=True if options.expressions is None else options.expressions,
+            verbose=not options.quiet,
+        )
     elif suffix == ".npz":
         avatar.export_weights(options.out)
         written(options.out, "skinning weights", quiet=options.quiet)
@@ -84,41 +83,25 @@ def run(options: Options) -> None:
         )
         written(options.out, f"{len(files)} meshes", quiet=options.quiet)
     else:
-        _write_mesh(options, avatar, motions)
+        if not motions:
+            mesh, what = avatar.canonical_mesh(), "canonical pose"
+        else:
+            (motion,) = motions.values()
+            frame = check_frame(options.frame or 0, motion)
+            mesh, what = avatar.animate(motion)[frame], f"frame {frame} of {motion.source}"
+        write = {".ply": xa.write_ply, ".obj": xa.write_obj}[suffix]
+        write(options.out, mesh.compute_normals())
+        written(options.out, f"{mesh.num_vertices} vertices, {what}", quiet=options.quiet)
 
 
-def _motions(options: Options, avatar: Avatar) -> dict[str, Motion]:
-    """Motions by the names that their clips get, y-up."""
+def _motions(options: Options, body: BodyModel) -> dict[str, Motion]:
+    """Motions, y up, by the names of their clips."""
     found: dict[str, Motion] = {}
     for path in options.motion:
-        motion = read_stretch(path, options, avatar.body)
+        motion = read_driven(path, options, body)
         stem = Path(motion.source).stem or "motion"
         name, number = stem, 2
         while name in found:
             name, number = f"{stem}_{number}", number + 1
         found[name] = motion
     return found
-
-
-def _write_glb(options: Options, avatar: Avatar, motions: dict[str, Motion]) -> None:
-    avatar.export_glb(
-        options.out,
-        motions or None,
-        influences=options.influences,
-        expressions=True if options.expressions is None else options.expressions,
-        verbose=not options.quiet,
-    )
-
-
-def _write_mesh(options: Options, avatar: Avatar, motions: dict[str, Motion]) -> None:
-    if motions:
-        (motion,) = motions.values()
-        frame = options.frame or 0
-        if not 0 <= frame < len(motion):
-            raise ValueError(f"--frame {frame}: {motion.source} has frames 0 to {len(motion) - 1}")
-        mesh, told = avatar.animate(motion)[frame], f"frame {frame} of {motion.source}"
-    else:
-        mesh, told = avatar.canonical_mesh(), "canonical pose"
-    write = {".ply": xa.write_ply, ".obj": xa.write_obj}[options.out.suffix.lower()]
-    write(options.out, mesh.compute_normals())
-    written(options.out, f"{mesh.num_vertices} vertices, {told}", quiet=options.quiet)

@@ -1,4 +1,4 @@
-"""How a command ends: exit codes, one clear line for an error, notices, signals."""
+"""Exit codes, error messages, notices and signals of a command."""
 
 from __future__ import annotations
 
@@ -13,18 +13,15 @@ from contextlib import contextmanager
 from types import FrameType
 
 FAILED, BAD_INPUT = 1, 2
-# What a path or a file that was named can be at fault for; other OSErrors are the machine's.
+# Errors of a path given by the user; every other OSError is a failure of the machine.
 _BAD_PATHS = (
-    FileNotFoundError,
-    FileExistsError,
-    IsADirectoryError,
-    NotADirectoryError,
-    PermissionError,
+    *(FileNotFoundError, FileExistsError, IsADirectoryError),
+    *(NotADirectoryError, PermissionError),
 )
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as batch systems send it: ends a command as Ctrl-C does."""
+    """SIGTERM, which batch systems send; it ends a command as Ctrl-C does."""
 
     signal = signal.SIGTERM
 
@@ -32,10 +29,10 @@ class Terminated(KeyboardInterrupt):
 def exit_code(
     run: Callable[[], None], *, spoken: Mapping[str, str] | None = None, debug: bool = False
 ) -> int:
-    """Run a command; errors become one message on stderr and an exit code.
+    """Run a command. An error becomes one message on stderr and an exit code.
 
-    `spoken` says how arguments of the library that messages name are called on the command line.
-    `debug` lets errors pass, with their traceback.
+    `spoken` maps the library's argument names, which messages contain, to options. With `debug`,
+    errors are raised with their traceback.
     """
     spoken = spoken or {}
     try:
@@ -43,17 +40,16 @@ def exit_code(
             run()
             sys.stdout.flush()
         return 0
-    except SystemExit as end:  # tyro's, after it has printed help or what is wrong
+    except SystemExit as end:  # raised by tyro, after it has printed help or an error
         return end.code if isinstance(end.code, int) else FAILED
     except KeyboardInterrupt as stop:
-        # What training raises says more; its state has been saved.
-        again = " On the command line that is: the same command with --resume."
-        _say(
-            f"\n{stop}{again}" if hasattr(stop, "fitted") else "\nstopped: nothing is half-written."
-        )
+        if hasattr(stop, "fitted"):  # an interrupted training, whose state has been saved
+            _say(f"\n{stop} On the command line: run the same command with --resume.")
+        else:
+            _say("\nstopped; no file was left incomplete.")
         return 128 + getattr(stop, "signal", signal.SIGINT)
     except BrokenPipeError:
-        # The reader of our output, `head` say, has left: nobody is there to be told.
+        # The reader of the output, such as `head`, has ended; there is no one to report to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:
@@ -65,13 +61,13 @@ def exit_code(
 
 
 def describe(error: Exception) -> tuple[str, int]:
-    """What to say of an error, and the exit code."""
+    """Message and exit code of an error."""
+    from ..learning import TrainingError
     from ..meshing import EmptyLevelSetError
-    from ..training import TrainingError
 
     text = str(error)
     if isinstance(error, OSError):
-        if error.strerror:  # raised by the system; our own have a sentence
+        if error.strerror:  # set by the system only; the library's errors have a full message
             text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
         return text, BAD_INPUT if isinstance(error, _BAD_PATHS) else FAILED
     if isinstance(error, EmptyLevelSetError | TrainingError):
@@ -80,12 +76,12 @@ def describe(error: Exception) -> tuple[str, int]:
         return text, BAD_INPUT
     if isinstance(error, MemoryError):
         return f"out of memory. {text}".strip(), FAILED
-    where = "; the same command with --debug shows where"
-    return f"{type(error).__name__}: {text or 'no message'}{where}", FAILED
+    hint = "(run the same command with --debug for the traceback)"
+    return f"{type(error).__name__}: {text or 'no message'} {hint}", FAILED
 
 
 def in_options(message: str, spoken: Mapping[str, str]) -> str:
-    """The message, with the command line's names of the arguments that it asks for."""
+    """The message, followed by the options for the arguments (`name=`) that it mentions."""
     named = dict.fromkeys(re.findall(r"\b([a-z_]+)=", message))
     options = [spoken[name] for name in named if name in spoken]
     return f"{message} (On the command line: {', '.join(options)}.)" if options else message
@@ -93,20 +89,20 @@ def in_options(message: str, spoken: Mapping[str, str]) -> str:
 
 @contextmanager
 def notices_as_lines(spoken: Mapping[str, str]) -> Iterator[None]:
-    """Notices of the library as one line each on stderr, none twice; other warnings as ever."""
+    """Print each notice of the library once, as one line on stderr; leave other warnings alone."""
     from ..datasets.capture import CaptureNotice
+    from ..learning import TrainingNotice
     from ..motion import MotionNotice
-    from ..training import TrainingNotice
 
-    notices, said = (CaptureNotice, MotionNotice, TrainingNotice), set()
+    notices, printed = (CaptureNotice, MotionNotice, TrainingNotice), set()
     with warnings.catch_warnings():
         usual = warnings.showwarning
 
         def show(message, category, filename, lineno, file=None, line=None):
             if not issubclass(category, notices):
                 usual(message, category, filename, lineno, file, line)
-            elif str(message) not in said:
-                said.add(str(message))
+            elif str(message) not in printed:
+                printed.add(str(message))
                 _say(f"notice: {in_options(str(message), spoken)}")
 
         for notice in notices:
@@ -117,7 +113,7 @@ def notices_as_lines(spoken: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _sigterm_raises() -> Iterator[None]:
-    """SIGTERM ends a command as Ctrl-C does, so that temporary files are removed."""
+    """Raise `Terminated` on SIGTERM, so that temporary files are removed as after Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

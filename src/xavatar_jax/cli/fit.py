@@ -1,4 +1,4 @@
-"""`xavatar fit`: learn an avatar, test it on motion it has not seen, and show both."""
+"""`xavatar fit`: train an avatar, evaluate it on held-out frames, and draw both."""
 
 from __future__ import annotations
 
@@ -9,86 +9,80 @@ from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from tyro.conf import Suppress
+from tyro.conf import OmitArgPrefixes, Suppress
 
 import xavatar_jax as xa
 
 from . import options as shared
-from .inputs import count_of, read_body, read_capture
-from .options import Count, File, Flag, Folder, Gender, Number, Target, Truth, Words
-from .outputs import check_folder
+from .files import check_output, count_of, read_body, read_capture
+from .options import Count, File, Flag, Folder, Number, Target
 
 if TYPE_CHECKING:
-    from ..avatar import Avatar, Fit
+    from ..avatar import Drivable
     from ..datasets import Capture
     from ..frames import Frames
-    from ..training import FitConfig
+    from ..methods import Fit
 
-# Entries of the config that have an option of their own.
+_LOADING = ("weights", "labels", "roots", "data")
+_TRAINING = ("train", "validation", "checkpoint", "polish", "guide", "redraw", "canonical")
+# Entries of the config with a short option.
 _SHORT = ("steps", "minutes", "seed", "train_frames", "prefit_steps")
 
 
 @dataclass
 class Options:
-    """Learn an avatar from posed meshes with SMPL-X parameters, and test it on held-out frames.
+    """Fit an avatar to posed meshes with SMPL-X parameters and evaluate it on held-out frames.
 
     Without options: the bundled body and capture, in minutes on two CPU cores.
 
-    After Ctrl-C the same command with --resume goes on.
+    After Ctrl-C, the same command with --resume continues the run.
 
-    Entries of the preset's config are options too, as --config.losses.surface 50.
+    Every entry of the preset's config is also an option, such as --config.losses.surface 50.
     --config.help lists them.
     """
 
     out: Target = Path("out/fit_grab")
-    """Folder to write to."""
+    """Output folder."""
+    method: Literal["xavatar", "snarf", "scanimate"] = "xavatar"
+    """Method to train. snarf and scanimate are baselines without fingers and expression."""
     preset: Literal["quick", "paper"] = "quick"
     """quick: minutes on a CPU. paper: the paper's networks and schedule, for a GPU."""
     steps: Count = None
-    """Training steps, in place of the preset's."""
+    """Number of training steps. Not for scanimate, whose three stages are set by --config."""
     minutes: Number = None
-    """Stop training so many minutes after it was begun, whatever the steps."""
+    """Time budget of training in minutes, counted from its start."""
     seed: Annotated[int, shared.arg(metavar="N")] = 0
-    """Of every draw."""
+    """Random seed."""
     train_frames: Count = None
-    """Frames to learn from, chosen for their variety (0: all)."""
-    eval_frames: Annotated[str, shared.arg(metavar="N|all")] = "24"
-    """Held-out frames to evaluate, spread over the sequences."""
+    """Number of training frames, chosen for their variety (0: all)."""
     prefit_steps: Count = None
-    """Steps that fit the first fields to the body's mean shape."""
+    """Steps that fit the model to the body's mean shape before training. Not for scanimate."""
     resume: Flag = False
-    """Go on from checkpoint.npz in the folder of --out, if there is one."""
+    """Continue from checkpoint.npz in the output folder, if it exists."""
     cache_dir: Folder = None
-    """In place of the user's cache folder."""
-    data: Folder = None
-    """A capture; without it the bundled one."""
-    test: Words = ()
-    """Sequences to hold out, where the data are not split already."""
-    flat_hand_mean: Truth = None
-    """Of meshes with parameters beside them. False: their hands are relative to the mean hand."""
+    """Cache folder (default: the user's)."""
     model_dir: Folder = None
-    """Body models, in the layout of smplx.create. With --data also SMPLX_MODEL_DIR is looked at."""
+    """Folder of body models, as for smplx.create (default with --data: SMPLX_MODEL_DIR)."""
     body: File = None
-    """One body model file."""
-    gender: Gender = None
-    """In place of the gender that the data name."""
+    """Body model file."""
     quiet: Flag = False
     """No progress bars, no table."""
+    capture: OmitArgPrefixes[shared.Data] = field(default_factory=shared.Data)
     config: Suppress[Any] = None
-    # A `FitConfig` in place of the preset's, as --config.NAME makes it.
+    # The preset's config with the --config.NAME options applied.
 
 
 def parse(arguments: Sequence[str], prog: str, description: str | None = None) -> Options:
-    """Options from a command line, `--config.NAME` among them."""
+    """Parse a command line, including its `--config.NAME` options."""
     own, entries = split_entries(arguments)
     options = shared.parse(Options, own, prog, description)
     if entries:
-        options.config = _changed(options.preset, entries, prog)
+        options.config = _changed(options.method, options.preset, entries, prog)
     return options
 
 
 def split_entries(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A command line without its `--config.NAME` options, and these with their values."""
+    """Split a command line into its own words and the `--config.NAME` options with values."""
     own: list[str] = []
     entries: list[str] = []
     current = own
@@ -99,20 +93,20 @@ def split_entries(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, entries
 
 
-def _changed(preset: str, entries: list[str], prog: str) -> FitConfig:
-    """The preset's config with entries replaced."""
-    from ..training import PRESETS, FitConfig
+def _changed(method: str, preset: str, entries: list[str], prog: str) -> Any:
+    """The preset's config with the given entries replaced."""
+    from ..methods import METHODS
 
     for word in entries:
         name = word.removeprefix("--config.").partition("=")[0].replace("-", "_")
         if name in _SHORT or name == "preset":
             option = f"--{name.replace('_', '-')}"
-            raise ValueError(f"{word}: this entry has an option of its own, {option}")
-    config = PRESETS[preset]()
-    hints = get_type_hints(FitConfig)
+            raise ValueError(f"{word}: use the option {option} for this entry")
+    config = METHODS[method].presets[preset]()
+    hints = get_type_hints(type(config))
     open_fields = [
         (f.name, hints[f.name], field(default=getattr(config, f.name)))
-        for f in fields(FitConfig)
+        for f in fields(config)
         if f.name not in (*_SHORT, "preset")
     ]
     entry_kind: Any = make_dataclass("Entries", open_fields, frozen=True)
@@ -120,47 +114,55 @@ def _changed(preset: str, entries: list[str], prog: str) -> FitConfig:
         "Config", [("config", entry_kind, field(default_factory=entry_kind))]
     )
     words = ["--help" if word == "--config.help" else word for word in entries]
-    about = f"Entries of the config of preset {preset}, with its values."
-    chosen = shared.parse(kind, words, f"{prog} --preset {preset}", about).config
+    about = f"Config entries of {method}, preset {preset}, with their values."
+    chosen = shared.parse(kind, words, f"{prog} --method {method} --preset {preset}", about).config
     return replace(config, **{f.name: getattr(chosen, f.name) for f in fields(chosen)})
 
 
-def configure(options: Options) -> FitConfig:
-    """The preset with what the options change."""
-    from ..training import PRESETS
+def configure(options: Options) -> Any:
+    """The config of the method and preset with the options applied.
 
-    config = PRESETS[options.preset]() if options.config is None else options.config
-    config = replace(config, seed=options.seed, minutes=options.minutes)
-    given = {name: getattr(options, name) for name in ("steps", "train_frames", "prefit_steps")}
-    return replace(config, **{name: value for name, value in given.items() if value is not None})
+    **Raises:** `ValueError` for an option that the method does not have.
+    """
+    from ..methods import METHODS
+
+    config = options.config
+    if config is None:
+        config = METHODS[options.method].presets[options.preset]()
+    known = {f.name for f in fields(config)}
+    given = {name: getattr(options, name) for name in _SHORT}
+    given = {name: value for name, value in given.items() if value is not None}
+    for name in given:
+        if name not in known:
+            raise ValueError(
+                f"--{name.replace('_', '-')} is not an option of {options.method}; "
+                f"xavatar fit --method {options.method} --config.help lists its entries"
+            )
+    return replace(config, **given)
 
 
 def load(options: Options) -> Capture:
-    """The capture that the options ask for, with its body."""
+    """The capture that the options name, with its body."""
     from ..datasets import find_gender
 
-    verbose = not options.quiet
-    models = options.model_dir
-    if models is None and options.data is not None and "SMPLX_MODEL_DIR" in os.environ:
+    models, data = options.model_dir, options.capture.data
+    if models is None and data is not None and "SMPLX_MODEL_DIR" in os.environ:
         models = Path(os.environ["SMPLX_MODEL_DIR"])
     if options.body is not None:
-        body = read_body(options.body, options.gender)
+        body = read_body(options.body, options.capture.gender)
     elif models is not None:
-        gender = options.gender or (find_gender(options.data) if options.data else None)
+        gender = options.capture.gender or (find_gender(data) if data else None)
         body = read_body(models, gender)
     else:
-        if verbose:
-            print("bundled body (made on first use, about a minute) ...", flush=True)
+        if not options.quiet:
+            print("bundled body (generated on first use, about a minute) ...", flush=True)
         body = xa.synthetic_body(options.cache_dir)
     return read_capture(
-        options.data,
+        options.capture,
         body,
-        gender=options.gender,
-        test=options.test,
         seed=options.seed,
-        flat_hand_mean=options.flat_hand_mean,
+        verbose=not options.quiet,
         cache=options.cache_dir,
-        verbose=verbose,
     )
 
 
@@ -168,13 +170,15 @@ def run(options: Options) -> None:
     """Fit, evaluate, and write avatar, metrics, meshes and pictures."""
     from .. import report
     from ..meshing import EmptyLevelSetError
+    from ..methods import METHODS
     from ..render import save_png, save_webp_animation
 
     started = time.perf_counter()
     verbose = not options.quiet
     out = options.out
-    count = count_of(options.eval_frames)
-    check_folder(out)
+    count = count_of(options.capture.eval_frames)
+    check_output(out, "folder")
+    config = configure(options)
     out.mkdir(parents=True, exist_ok=True)
     capture = load(options)
     body = capture.body
@@ -185,9 +189,9 @@ def run(options: Options) -> None:
             f"frames, {body.num_vertices} vertices, {body.source.describe()}",
             flush=True,
         )
-    result = xa.fit(
+    result = METHODS[options.method].fit(
         capture.train,
-        configure(options),
+        config,
         cache=options.cache_dir,
         verbose=verbose,
         checkpoint=out / "checkpoint.npz",
@@ -197,18 +201,20 @@ def run(options: Options) -> None:
     avatar, history = result
     avatar.save(out / "avatar.npz")
     fitted = time.perf_counter()
-    # The held-out frames are read from here on, and nowhere before.
+    # No held-out frame is read before this point.
     try:
         evaluation = xa.evaluate(
             avatar, capture.test, learned_from=result.frames, num_frames=count, verbose=verbose
         )
-        # Step 0 is only a reference: a quarter of the frames are enough for it.
-        few = max(len(evaluation.per_frame) // 4, 1)
-        before = xa.evaluate(result.before, capture.test, num_frames=few, verbose=verbose)
+        before = None
+        if result.before is not None:
+            # A quarter of the frames is enough for step 0, which is only a reference.
+            few = max(len(evaluation.per_frame) // 4, 1)
+            before = xa.evaluate(result.before, capture.test, num_frames=few, verbose=verbose)
     except EmptyLevelSetError as error:
         raise EmptyLevelSetError(
             f"no surface to evaluate, after {history.steps_done} steps or at step 0: {error} The "
-            f"avatar and its checkpoint are in {out}; take more --steps (with --resume) or more "
+            f"avatar and its checkpoint are in {out}; increase --steps (with --resume) or "
             "--prefit-steps."
         ) from error
     evaluated = time.perf_counter()
@@ -224,10 +230,10 @@ def run(options: Options) -> None:
     finished = time.perf_counter()
     stages = history.seconds
     seconds = {
-        "data": loaded - started + sum(stages.get(k, 0) for k in ("settle", "labels", "roots")),
+        "data": loaded - started + sum(stages.get(k, 0) for k in _LOADING),
         "prefit": stages["prefit"],
         "compile": stages.get("compile", 0.0),
-        "train": sum(stages.get(k, 0) for k in ("train", "validation", "checkpoint", "redraw")),
+        "train": sum(stages.get(k, 0) for k in _TRAINING),
         "evaluate": evaluated - fitted,
         "pictures": finished - evaluated,
         "total": finished - started,
@@ -240,6 +246,8 @@ def run(options: Options) -> None:
         stages={name: round(value, 2) for name, value in stages.items()},
         training=training_record(result),
         data=capture.name,
+        preset=options.preset,
+        seed=options.seed,
         notices=[*capture.notices, *history.notices],
     )
     report.write_json(out / "metrics.json", record)
@@ -252,7 +260,7 @@ def run(options: Options) -> None:
 
 
 def training_record(result: Fit) -> dict[str, Any]:
-    """How training ended, for the metrics."""
+    """How training ended, for metrics.json."""
     history = result.history
     return {
         "steps_done": history.steps_done,
@@ -263,8 +271,8 @@ def training_record(result: Fit) -> dict[str, Any]:
     }
 
 
-def write_meshes(avatar: Avatar, test: Frames, out: Path) -> list[Path]:
-    """One posed mesh of each held-out sequence beside its ground truth, as PLY."""
+def write_meshes(avatar: Drivable, test: Frames, out: Path) -> list[Path]:
+    """Write one posed mesh per held-out sequence and its ground truth, as PLY."""
     import numpy as np
 
     from ..meshing import Mesh
@@ -273,7 +281,7 @@ def write_meshes(avatar: Avatar, test: Frames, out: Path) -> list[Path]:
     for name, frames in test.sequences.items():
         frame = frames[len(frames) // 2]
         for mesh, kind in (
-            (avatar.mesh(frame.params), "avatar"),
+            (avatar.surface(frame.params), "avatar"),
             (Mesh(np.asarray(frame.vertices), np.asarray(frame.faces)), "truth"),
         ):
             path = out / f"{name}_{kind}.ply"

@@ -1,4 +1,4 @@
-"""What the command lines share: types of options, and how they are read and shown."""
+"""Option types and option groups shared by the commands; parsing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 T = TypeVar("T")
 
-# "(default: None)" and "(default: False)" are noise in a help page.
+# An empty hint hides "(default: None)" and "(default: False)" in help pages.
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Count = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, arg(metavar="X", help_behavior_hint="")]
@@ -35,62 +35,78 @@ Truth = Annotated[bool | None, arg(metavar="{True,False}", help_behavior_hint=""
 
 @dataclass(kw_only=True)
 class Reading:
-    """How MOTION is read, where the file does not say it all."""
+    """How to read MOTION, where the file leaves it open."""
 
     read_as: Word = None
-    """Its format, if it could be several: see docs/motion.md."""
+    """Format of MOTION, if the file could be of several: see docs/motion.md."""
     file_fps: Number = None
-    """Its frames a second, if the file does not say or is wrong."""
+    """Frames per second of MOTION, if the file lacks them or is wrong."""
     file_up: Up = None
-    """The axis that points up in it, if not that of its format."""
+    """Up axis of MOTION, if it is not that of its format."""
     person: Count = None
-    """Which person, of a file with several."""
+    """Number of the person, in a file with several."""
     flat_hand_mean: Truth = None
-    """True: its hands are absolute; False: relative to the mean hand."""
-    joint_map: Word = None
-    """BVH: whose joint names (smplx, smpl, mixamo, cmu), if they are not recognised."""
+    """Hand poses of MOTION. True: absolute; False: relative to the mean hand."""
+    joint_map: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """BVH: JSON file that maps its joint names to those of SMPL-X, or smplx, smpl, mixamo, cmu."""
     scale: Number = None
-    """BVH: metres in one of its units, if not told by the length of the legs."""
+    """BVH: metres per unit (default: from the length of the legs)."""
 
 
 @dataclass(kw_only=True)
 class Driven:
-    """What commands share in which an avatar follows a motion: `inputs.read_stretch` reads it."""
+    """Options of the commands in which an avatar follows a motion; see `files.read_driven`."""
 
     fps: Number = None
-    """Frames a second; without it the motion's own."""
+    """Frames per second (default: those of the motion)."""
     start: Seconds = None
-    """Leave out what is before."""
+    """Start of the part of MOTION that is used."""
     end: Seconds = None
-    """Leave out what is after."""
+    """End of the part of MOTION that is used."""
     body: File = None
-    """The body model, if it is not where the avatar was learned ("bundled": our own)."""
+    """Body model, if it is not where the avatar was trained ("bundled": the bundled body)."""
     template: File = None
-    """The person's own template mesh, for an avatar that was learned on one."""
+    """Template mesh of the person, if the avatar was trained on one."""
     quiet: Flag = False
     """No progress bars, no report."""
     reading: OmitArgPrefixes[Reading] = field(default_factory=Reading)
 
 
-# Arguments of `load_motion` that have another name on the command line.
-READING_NAMES = {"format": "--read-as", "fps": "--file-fps", "up": "--file-up"}
+@dataclass(kw_only=True)
+class Data:
+    """Capture with training and held-out frames."""
+
+    data: Folder = None
+    """Folder of the capture (default: the bundled one)."""
+    test: Words = ()
+    """Sequences to hold out, if the capture has no train and test folders."""
+    flat_hand_mean: Truth = None
+    """Hand poses of meshes with parameters. True: absolute; False: relative to the mean hand."""
+    eval_frames: Annotated[str, arg(metavar="N|all")] = "24"
+    """Number of held-out frames to evaluate, spread over the sequences."""
+    gender: Gender = None
+    """Gender of the body, instead of the one that the data name."""
 
 
 def parse(
     options: type[T], arguments: Sequence[str], prog: str, description: str | None = None
 ) -> T:
-    """Options from a command line. Prints help or what is wrong, and exits with 0 or 2."""
+    """Parse a command line. Prints help or an error and exits with 0 or 2 where that applies."""
     return tyro.cli(
         options,
         prog=prog,
         description=inspect.cleandoc(description or options.__doc__ or ""),
         args=list(arguments),
-        config=(tyro.conf.PositionalMetavarFromFieldName, tyro.conf.FlagCreatePairsOff),
+        config=(
+            tyro.conf.PositionalMetavarFromFieldName,
+            tyro.conf.FlagCreatePairsOff,
+            tyro.conf.AvoidSubcommands,
+        ),
     )
 
 
 def option_names(options: type) -> dict[str, str]:
-    """Options of a command line by the names of their fields; positional ones are left out."""
+    """Options of a command line by field name, without positional arguments."""
     found: dict[str, str] = {}
     hints = get_type_hints(options, include_extras=True)
     for entry in fields(options):
@@ -105,5 +121,12 @@ def option_names(options: type) -> dict[str, str]:
 
 
 def spoken_names(command: Any) -> dict[str, str]:
-    """How arguments of the library are called on the command line of a subcommand's module."""
-    return {**option_names(command.Options), **getattr(command, "SPOKEN", {})}
+    """Options of a subcommand's module by the library's argument names, for messages.
+
+    Arguments of `load_motion` have other names on the command line; `SPOKEN` in the module adds
+    more.
+    """
+    names = option_names(command.Options)
+    if "read_as" in names:
+        names |= {"format": "--read-as", "fps": "--file-fps", "up": "--file-up"}
+    return names | getattr(command, "SPOKEN", {})

@@ -1,4 +1,4 @@
-"""`xavatar view`: an avatar in the browser, or as one page that plays anywhere."""
+"""`xavatar view`: an avatar in the browser, or as one self-contained page."""
 
 from __future__ import annotations
 
@@ -8,34 +8,29 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from .inputs import read_avatar, read_stretch
-from .options import READING_NAMES, Driven, Flag, OptionalPath, arg
-from .outputs import check_file, written
-
-SPOKEN = READING_NAMES
+from .files import check_output, read_avatar, read_driven, written
+from .options import Driven, Flag, OptionalPath, arg
 
 
 @dataclass
 class Options(Driven):
-    """Pose an avatar by sliders in the browser, or play a motion.
+    """Pose an avatar with sliders in the browser, or play a motion. Stop with Ctrl-C.
 
-    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of ours.
-
-    Ends with Ctrl-C; with --html it writes a page and ends at once.
+    MOTION: a file or folder, as in docs/motion.md, or "bundled", a motion of the library.
     """
 
     avatar: Positional[Path]
-    """Avatar file, as `xavatar fit` writes it."""
+    """Avatar file written by `xavatar fit`."""
     motion: OptionalPath = None
-    """What it is to do; without one it stands at rest."""
+    """Motion to play (default: the rest pose)."""
     html: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
-    """Write one page that needs no server and no network, in place of a viewer."""
+    """Page to write instead of starting a viewer; it needs no server and no network."""
     port: int = 8080
-    """Of the page; the next free one if it is taken."""
+    """Port of the viewer; the next free one if it is taken."""
     host: str = "localhost"
-    """0.0.0.0 answers every machine of the network."""
+    """Address that the viewer listens on; 0.0.0.0 serves the whole network."""
     open: Flag = False
-    """Open the page in the browser of this machine."""
+    """Open the viewer in the browser of this machine."""
 
 
 def run(options: Options) -> None:
@@ -43,14 +38,14 @@ def run(options: Options) -> None:
     from ..viewer import view, view_html
 
     if options.html is not None:
-        check_file(options.html)
+        check_output(options.html)
     avatar = read_avatar(options.avatar, options.body, options.template)
     motion = None
     if options.motion is not None:
-        motion = read_stretch(options.motion, options, avatar.body)
+        motion = read_driven(options.motion, options, avatar.body)
     if options.html is not None:
         view_html(options.html, avatar, motion, title=options.avatar.stem)
-        written(options.html, "a page that plays alone", quiet=options.quiet)
+        written(options.html, "a self-contained page", quiet=options.quiet)
         return
     with view(
         avatar,

@@ -1,270 +1,214 @@
-"""The fast search: all starts of many points as lanes, then a few distinct roots a point."""
+"""Many small solves at once.
+
+Under `vmap` a loop runs every lane until the last one ends, and some starts never converge. Here
+lanes are solved block by block: all lanes of a block are stepped together, and when enough of them
+have ended, the rest is gathered into a narrower block. Shapes are fixed, so it works under `jit`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..fields import AbstractSkinningField, PosedGrid, skin_with_jacobian
-from ..kinematics import inverse_3x3, skin_points
-from .broyden import Broyden
-from .lanes import Solved, solve_lanes
-from .newton import ClosedFormNewton
-from .plain import DIVERGENCE
-from .roots import Outcome, Roots, distinct_roots, outcomes
-from .starts import StartTable, pull_back_all
+from .root_finders import AbstractRootState
 
-GRID_SOLVER = ClosedFormNewton(atol=1e-5, divergence=DIVERGENCE)
-FIELD_SOLVER = Broyden(atol=1e-5, divergence=DIVERGENCE)
-# What is searched on a guide is moved on afterwards: near is enough, and what ends at the edge of a
-# fold of one field may have a root in the other. Such places repeat, so more of them are kept, and
-# none is merged: two that are near on the guide may be two roots of the field.
-NEAR_SOLVER = ClosedFormNewton(atol=1e-3, divergence=DIVERGENCE)
-NEAR_MORE = 6
-# Starts of a point that have come this close, in metres, are on their way to one root.
-MERGE = 2e-4
-# Points searched at a time: bounds memory, and costs nothing above a few thousand.
-CHUNK = 8192
-
-Solve = Callable[..., Solved]
-Covers = Callable[[Array], Array]
+# Widths of the narrower blocks, as fractions of the first: most lanes end early, a few late.
+_NARROWER = (2, 8, 64)
+_LEAST_WIDTH = 16
+# Lanes of a group are compared up to this many rows apart: starts that meet first, those of one
+# limb or finger, are next to each other.
+_REACH = 12
 
 
-@partial(jax.jit, static_argnames=("solver", "keep", "max_steps", "width", "merge", "chunk"))
-def search_grid(
-    grid: PosedGrid,
-    x_d: Float[Array, "P 3"],
-    parts: Int[Array, " P"],
-    transforms: Float[Array, "J 4 4"],
-    starts: StartTable,
-    *,
-    solver: optx.AbstractRootFinder = GRID_SOLVER,
-    keep: int = 6,
-    max_steps: int = 15,
-    width: int = 8192,
-    merge: float = MERGE,
-    chunk: int = CHUNK,
-) -> Roots:
-    """Roots of the tabulated field of one frame, for points with part labels.
+class Solved(NamedTuple):
+    """Results of L lanes.
 
-    Newton's method with the exact Jacobian of the cell that an iterate lies in.
-
-    - `grid`: `pose_grid(tabulate(field, grids), transforms)`; residuals are those of the
-      interpolated field.
-    - `parts`: each point's row of `starts`, which `start_table` gives.
-    - `keep`: roots kept a point; `merge`: metres, 0 for never; `chunk`: points at a time.
-
-    **Raises:** `ValueError` when tracing for a wrong shape. What a point met at run time is its
-    `outcome`.
+    - `y`: `(L, n)` the last iterate; `residual`: `(L,)` its norm, infinite for inactive lanes.
+    - `steps`: `(L,)`.
     """
 
-    def residual(x: Array, target: Array) -> tuple[Array, Array]:
-        point, jacobian = grid(x)
-        return point - target, jacobian
-
-    solve = partial(solve_lanes, solver, residual, max_steps=max_steps, width=width, merge=merge)
-    return _search(solve, grid.grids.covers, solver, x_d, parts, transforms, starts, keep, chunk)
+    y: Float[Array, "L n"]
+    residual: Float[Array, " L"]
+    steps: Int[Array, " L"]
 
 
-@eqx.filter_jit
-def search_field(
-    field: AbstractSkinningField,
-    x_d: Float[Array, "P 3"],
-    parts: Int[Array, " P"],
-    transforms: Float[Array, "J 4 4"],
-    starts: StartTable,
+class _Block(NamedTuple):
+    """W lanes in progress; `going` is false for those that have ended."""
+
+    y: Float[Array, "W n"]
+    state: PyTree
+    error: Float[Array, " W"]
+    args: PyTree
+    group: Int[Array, " W"]
+    going: Bool[Array, " W"]
+    steps: Int[Array, " W"]
+
+
+def solve_batched(
+    solver: optx.AbstractRootFinder,
+    fn: Callable[[Array, PyTree], tuple[Array, Any]],
+    start: Float[Array, "L n"],
+    args: PyTree,
+    active: Bool[Array, " L"],
     *,
-    guide: PosedGrid | None = None,
-    solver: Broyden = FIELD_SOLVER,
-    keep: int = 6,
+    options: Callable[[Array, PyTree], dict[str, Any]] | None = None,
     max_steps: int = 50,
-    width: int = 2048,
-    merge: float = MERGE,
-    chunk: int = CHUNK,
-) -> Roots:
-    """Roots of any field, for points with part labels.
+    width: int = 4096,
+    group_size: int = 1,
+    merge: float = 0.0,
+) -> Solved:
+    """Run any root finder from the start of every active lane.
 
-    Without a `guide`, by Broyden's method from the exact Jacobian at each start, one query of the
-    field a step. With a `guide`, the same field tabulated and posed, the search runs on that to a
-    millimetre, and the few distinct places found are moved to the field's own roots by Newton's
-    method: the residuals are the field's, at a handful of queries a point. Other arguments are as
-    for `search_grid`; with a guide, starts are not merged, and of `solver` and `max_steps` the
-    tolerance alone is used.
+    `fn(y, args)` is as for `optimistix.root_find(..., has_aux=True)`; the leaves of `args` have a
+    leading lane axis. A lane ends by the solver's own `terminate` or after `max_steps`. `width`
+    lanes are stepped together. `options(y, args)` gives the solver's options at the start.
+
+    Every `group_size` consecutive lanes solve one equation from different starts. Once the
+    residual of one is below `merge`, the others within that distance of it end.
     """
-    if guide is not None:
-        near = search_grid(
-            guide,
-            x_d,
-            parts,
-            transforms,
-            starts,
-            solver=NEAR_SOLVER,
-            keep=keep + NEAR_MORE,
-            merge=0.0,
-            chunk=chunk,
+    lanes = start.shape[0]
+    width = min(width, lanes)
+    widths = [width, *(width // k for k in _NARROWER if width // k >= _LEAST_WIDTH)]
+    driver = _Driver(solver, fn, options or (lambda y, a: {}), max_steps, group_size, merge)
+    place = jnp.cumsum(active)  # the number of each active lane, from 1
+    group = jnp.arange(lanes) // group_size
+
+    def block(k: Array, out: Solved) -> Solved:
+        rows = _find(place, k * width, width)
+        y, own, of = _take((start, args, group), rows)
+        solved = driver.solve(y, own, of, rows < lanes, widths)
+        return jax.tree.map(
+            lambda all_, new: jax.lax.dynamic_update_slice_in_dim(all_, new, k * width, 0),
+            out,
+            solved,
         )
-        return polish(field, near, x_d, transforms, keep=keep, atol=solver.atol, width=width)
 
-    def residual(x: Array, target: Array) -> tuple[Array, None]:
-        return skin_points(x, field(x), transforms) - target, None
-
-    def options(x: Array, target: Array) -> dict[str, Array]:
-        jacobian = jax.jacfwd(lambda v: residual(v, target)[0])(x)
-        return {"inverse_jacobian": inverse_3x3(jacobian)}
-
-    solve = partial(
-        solve_lanes,
-        solver,
-        residual,
-        options=options,
-        max_steps=max_steps,
-        width=width,
-        merge=merge,
+    size = -(-lanes // width) * width
+    out = Solved(
+        jnp.zeros((size, *start.shape[1:]), start.dtype),
+        jnp.full(size, jnp.inf, start.dtype),
+        jnp.zeros(size, jnp.int32),
     )
-    covers = jax.vmap(field.covers)
-    return _search(solve, covers, solver, x_d, parts, transforms, starts, keep, chunk)
+    out = jax.lax.fori_loop(0, -(-place[-1] // width), block, out)
+    y, residual, steps = _take(out, place - 1)
+    return Solved(y, jnp.where(active, residual, jnp.inf), jnp.where(active, steps, 0))
 
 
-def polish(
-    field: AbstractSkinningField,
-    roots: Roots,
-    x_d: Float[Array, "P 3"],
-    transforms: Float[Array, "J 4 4"],
-    *,
-    keep: int | None = None,
-    atol: float = 1e-5,
-    max_steps: int = 8,
-    width: int = 2048,
-) -> Roots:
-    """Roots of a nearby field moved to those of this one, by Newton's method.
+class _Driver(NamedTuple):
+    solver: optx.AbstractRootFinder
+    fn: Callable[[Array, PyTree], tuple[Array, Any]]
+    options: Callable[[Array, PyTree], dict[str, Any]]
+    max_steps: int
+    group_size: int
+    merge: float
 
-    Those that do not get there are dropped, and two that become one count once. At most `keep`
-    are returned a point (default: as many as were given).
+    def solve(
+        self, y: Array, args: PyTree, group: Array, active: Array, widths: list[int]
+    ) -> Solved:
+        """Solve one block from its starts."""
+
+        def init(y: Array, a: PyTree) -> Any:
+            structs = jax.eval_shape(self.fn, y, a)
+            return self.solver.init(self.fn, y, a, self.options(y, a), *structs, frozenset())
+
+        # What is no array in a solver's state is the same in all lanes and steps.
+        state, static = eqx.partition(eqx.filter_vmap(init)(y, args), eqx.is_array)
+        steps = jnp.zeros(active.shape, jnp.int32)
+        error = jnp.zeros(active.shape, y.dtype)
+        block = _Block(y, state, error, args, group, active, steps)
+        return self.narrow(self.close(block, static), static, widths)
+
+    def narrow(self, block: _Block, static: Any, widths: list[int]) -> Solved:
+        """Step until the unfinished lanes fit the next width; continue with those alone."""
+        smaller = widths[1] if len(widths) > 1 else 0
+        # The last lanes in the narrowest blocks rarely meet others.
+        merging = self.merge > 0 and self.group_size > 1 and len(widths) > 2
+
+        def advance(block: _Block) -> _Block:
+            block = self.advance(block, static)
+            if merging:
+                near = _near_better(block, min(self.group_size - 1, _REACH), self.merge)
+                block = block._replace(going=block.going & ~near)
+            return block
+
+        block = jax.lax.while_loop(lambda b: jnp.sum(b.going) > smaller, advance, block)
+        solved = Solved(block.y, block.error, block.steps)
+        if not smaller:
+            return solved
+        place = jnp.cumsum(block.going)
+        rest = _take(block, _find(place, 0, smaller))
+        rest = rest._replace(going=jnp.arange(smaller) < place[-1])
+        after = _take(self.narrow(rest, static, widths[1:]), place - 1)
+        return _where(block.going, after, solved)
+
+    def advance(self, block: _Block, static: Any) -> _Block:
+        """Step every unfinished lane."""
+
+        def step(y: Array, a: PyTree, state: Any) -> tuple[Array, Any]:
+            state = eqx.combine(state, static)
+            y, state, _ = self.solver.step(self.fn, y, a, {}, state, frozenset())
+            return y, eqx.filter(state, eqx.is_array)
+
+        moved = jax.vmap(step)(block.y, block.args, block.state)
+        y, state = _where(block.going, moved, (block.y, block.state))
+        block = block._replace(y=y, state=state, steps=block.steps + block.going)
+        return self.close(block, static)
+
+    def close(self, block: _Block, static: Any) -> _Block:
+        """Measure the residuals; end the lanes that are done or out of steps."""
+
+        def look(y: Array, a: PyTree, state: Any) -> tuple[Array, Array]:
+            state = eqx.combine(state, static)
+            done = self.solver.terminate(self.fn, y, a, {}, state, frozenset())[0]
+            known = isinstance(state, AbstractRootState)
+            residual = state.residual if known else self.fn(y, a)[0]
+            return jnp.sqrt(jnp.sum(residual**2)), done
+
+        error, done = jax.vmap(look)(block.y, block.args, block.state)
+        going = block.going & ~done & (block.steps < self.max_steps)
+        return block._replace(error=error, going=going)
+
+
+def _near_better(block: _Block, reach: int, radius: float) -> Bool[Array, " W"]:
+    """Whether a better lane of the same group is within `radius`, and almost at its root.
+
+    Two lanes at one place lead to the same root only close to it; far from any root both go on.
     """
-    solver = ClosedFormNewton(atol=atol, divergence=DIVERGENCE)
-
-    def residual(x: Array, target: Array) -> tuple[Array, Array]:
-        posed, jacobian, _ = skin_with_jacobian(field, x, transforms)
-        return posed - target, jacobian
-
-    points, given = roots.valid.shape
-    if not points:
-        return _no_roots(x_d, keep or given)
-    solved = solve_lanes(
-        solver,
-        residual,
-        roots.x_c.reshape(-1, 3),
-        jnp.repeat(x_d, given, axis=0),
-        roots.valid.reshape(-1),
-        max_steps=max_steps,
-        width=width,
-    )
-    valid = (solved.residual < atol) & jax.vmap(field.covers)(solved.y)
-    shaped = (points, given)
-    x_c, error, valid, more = distinct_roots(
-        solved.y.reshape(points, given, 3),
-        solved.residual.reshape(shaped),
-        valid.reshape(shaped),
-        keep or given,
-    )
-    lost = (roots.outcome == Outcome.found) & ~jnp.any(valid, axis=1)
-    where = jax.vmap(lambda gone, cause: Outcome.where(gone, Outcome.not_converged, cause))
-    outcome = where(lost, roots.outcome)
-    steps = roots.steps + jnp.sum(solved.steps)
-    return Roots(x_c, valid, error, outcome, roots.more | more, steps, roots.lanes)
+    size = block.y.shape[0]
+    pad = lambda v, fill: jnp.pad(v, (reach, reach), constant_values=fill)  # noqa: E731
+    group = pad(block.group, -1)
+    # One coordinate at a time vectorises over lanes.
+    axes = [pad(block.y[:, k], jnp.inf) for k in range(block.y.shape[1])]
+    error = pad(block.error, jnp.inf)
+    here = slice(reach, reach + size)
+    found = jnp.zeros(size, bool)
+    for shift in (*range(-reach, 0), *range(1, reach + 1)):
+        other = slice(reach + shift, reach + shift + size)
+        apart = sum(((v[here] - v[other]) ** 2 for v in axes), jnp.zeros((), error.dtype))
+        better = error[other] <= error[here] if shift < 0 else error[other] < error[here]
+        close = (apart < radius**2) & (error[other] < radius)
+        found |= (group[here] == group[other]) & close & better
+    return found
 
 
-def _search(
-    solve: Solve,
-    covers: Covers,
-    solver: Any,
-    x_d: Array,
-    parts: Array,
-    transforms: Array,
-    starts: StartTable,
-    keep: int,
-    chunk: int,
-) -> Roots:
-    """Search in chunks of points; `solve` drives the lanes that it is given."""
-    _check_shapes(x_d, parts, transforms, starts)
-    rigid = jnp.all(_rigid_up_to_scale(transforms))
-
-    def one_chunk(chunk: tuple[Array, Array]) -> Roots:
-        x, part = chunk
-        known = (part >= 0) & (part < starts.index.shape[0])
-        part = jnp.where(known, part, 0)
-        started = starts.mask[part] & known[:, None]
-        usable = started & rigid & jnp.all(jnp.isfinite(x), axis=-1, keepdims=True)
-        pulled = pull_back_all(x, transforms, starts)
-        start = jnp.take_along_axis(pulled, starts.index[part][..., None], axis=1)
-        target = jnp.repeat(x, starts.width, axis=0)
-        solved = solve(start.reshape(-1, 3), target, usable.reshape(-1), group_size=starts.width)
-        converged = solved.residual < solver.atol
-        valid = converged & covers(solved.y)
-        residual, converged, valid = (
-            v.reshape(started.shape) for v in (solved.residual, converged, valid)
-        )
-        x_c, error, found, more = distinct_roots(
-            solved.y.reshape(*started.shape, 3), residual, valid, keep
-        )
-        outcome = outcomes(x, rigid, started, residual, converged, valid, solver.divergence)
-        steps, lanes = jnp.sum(solved.steps), jnp.sum(usable)
-        return Roots(x_c, found, error, outcome, more, steps, lanes)
-
-    points = x_d.shape[0]
-    if points <= chunk:
-        return one_chunk((x_d, parts)) if points else _no_roots(x_d, keep)
-    fill = -points % chunk
-    # Padding has no part, so it starts nowhere.
-    padded = jnp.pad(x_d, ((0, fill), (0, 0))), jnp.pad(parts, (0, fill), constant_values=-1)
-    rows = jax.lax.map(
-        one_chunk, jax.tree.map(lambda v: v.reshape(-1, chunk, *v.shape[1:]), padded)
-    )
-    steps, lanes = jnp.sum(rows.steps), jnp.sum(rows.lanes)
-    flat = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:points] if v.ndim > 1 else v, rows)
-    return eqx.tree_at(lambda r: (r.steps, r.lanes), flat, (steps, lanes))
+def _find(place: Int[Array, " L"], first: Array | int, count: int) -> Int[Array, " count"]:
+    """Rows of the active lanes `first` to `first + count`; past the end where there are fewer."""
+    wanted = first + jnp.arange(1, count + 1, dtype=place.dtype)
+    return jnp.searchsorted(place, wanted)
 
 
-def _no_roots(x_d: Array, keep: int) -> Roots:
-    none = jnp.zeros((0, keep), bool)
-    zero = jnp.zeros((), jnp.int32)
-    outcome = jax.vmap(lambda _: Outcome.no_start)(x_d)
-    return Roots(
-        jnp.zeros((0, keep, 3), x_d.dtype),
-        none,
-        jnp.zeros((0, keep), x_d.dtype),
-        outcome,
-        none[:, 0],
-        zero,
-        zero,
-    )
+def _take(tree: Any, rows: Int[Array, " n"]) -> Any:
+    return jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), tree)
 
 
-def _rigid_up_to_scale(transforms: Float[Array, "J 4 4"]) -> Bool[Array, " J"]:
-    linear = transforms[:, :3, :3]
-    gram = jnp.sum(linear[:, :, :, None] * linear[:, :, None, :], axis=1)
-    scale_sq = jnp.trace(gram, axis1=1, axis2=2) / 3
-    off = jnp.abs(gram - scale_sq[:, None, None] * jnp.eye(3, dtype=linear.dtype)).max((1, 2))
-    return (off < 1e-3 * scale_sq) & jnp.all(jnp.isfinite(transforms), axis=(1, 2))
+def _where(mask: Bool[Array, " W"], new: Any, old: Any) -> Any:
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
 
-
-def _check_shapes(x_d: Any, parts: Any, transforms: Any, starts: StartTable) -> None:
-    for name, value, expected in (
-        ("x_d", x_d, (None, 3)),
-        ("parts", parts, (x_d.shape[0],)),
-        ("transforms", transforms, (len(starts.parents), 4, 4)),
-    ):
-        shape = jnp.shape(value)
-        fits = len(shape) == len(expected) and all(
-            e is None or s == e for s, e in zip(shape, expected, strict=True)
-        )
-        if not fits:
-            wanted = tuple("any" if e is None else e for e in expected)
-            raise ValueError(f"{name} has shape {shape}, expected {wanted}")
+    return jax.tree.map(choose, new, old)

@@ -1,4 +1,4 @@
-"""`Capture`, and what the loaders of all layouts share: split, shape and gender."""
+"""`Capture`, and the split, shape and gender rules shared by all loaders."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ NUM_TRAIN, NUM_TEST = 9, 3  # sequences, as in X-Avatar's experiments on GRAB
 
 
 class CaptureNotice(UserWarning):
-    """Something about a capture was assumed, or differs from what was expected."""
+    """An assumption about a capture, or data that differs from what was expected."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Capture:
-    """Frames of one person, split into those to learn from and those to be tested on.
+    """Frames of one person, split into training and test.
 
     Attributes:
-        name: of the subject or folder.
+        name: name of the subject or folder.
         body: the body the parameters are for, with the subject's own template if there is one.
         train, test: frames, y-up, metres.
-        betas: the one shape of the person.
+        betas: the shape of the person.
         gender: "neutral", "male", "female", or "unknown".
-        fps: frames a second of the sequences, NaN where unknown.
-        notices: what was assumed or changed on the way.
+        fps: frames per second; NaN if unknown, or if the sequences differ.
+        notices: what was assumed or changed while loading.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Capture:
 
 
 def notify(notices: Sequence[str]) -> tuple[str, ...]:
-    """Warn of each notice once, and give them back for the record."""
+    """Issue each notice as a warning, and return them all."""
     for notice in notices:
         warnings.warn(notice, CaptureNotice, stacklevel=3)
     return tuple(notices)
@@ -56,18 +56,18 @@ def notify(notices: Sequence[str]) -> tuple[str, ...]:
 def split_names(
     names: Sequence[str], *, test: Sequence[str] | None, seed: int, source: str | Path
 ) -> tuple[list[str], list[str]]:
-    """Split sequences into training and test, by name or by chance.
+    """Split sequences into training and test, by name or at random.
 
-    Twelve or more are sampled down to nine and three as the paper does; fewer are split 3:1.
+    Twelve or more are sampled down to nine and three, as in the paper; fewer are split 3:1.
 
     Args:
         names: all sequences.
-        test: those to hold out; all others are for training. None chooses by `seed`.
-        seed: of the choice.
+        test: sequences to hold out; all others are for training. None to choose by `seed`.
+        seed: random seed.
         source: the folder, for messages.
 
     Raises:
-        ValueError: a name in `test` is unknown, or nothing would be left on one side.
+        ValueError: a name in `test` is unknown, or one part would be empty.
     """
     if test is not None:
         unknown = [name for name in test if name not in names]
@@ -96,11 +96,11 @@ def split_names(
 def one_shape(
     shapes: Mapping[str, Float[np.ndarray, " S"]], tolerance: float = 1e-4
 ) -> tuple[Float[np.ndarray, " S"], str | None]:
-    """One shape for a subject: the shapes given if they agree, else their mean and a notice.
+    """One shape for a subject: the common shape if they agree, else their mean and a notice.
 
     Args:
-        shapes: betas by source; shorter ones are filled with zeros.
-        tolerance: largest difference from the mean that still counts as agreement.
+        shapes: betas by source; shorter ones are padded with zeros.
+        tolerance: largest difference from the mean that counts as agreement.
     """
     size = max(len(betas) for betas in shapes.values())
     stacked = np.stack([np.pad(b, (0, size - len(b))) for b in shapes.values()])
@@ -121,14 +121,14 @@ def resolve_gender(
     """The subject's gender from its files, checked against the body's.
 
     Args:
-        found: gender by source, as the files say.
+        found: gender by source, as the files state it.
         body: its `source.gender` must be the subject's.
-        override: takes the place of what the files say.
+        override: overrides what the files state.
         source: the folder, for messages.
 
     Raises:
-        ValueError: the files disagree with one another or with the body, and no `override`
-            settles it; or `override` disagrees with the body.
+        ValueError: without `override`, the files disagree with one another or with the body;
+            or `override` disagrees with the body.
     """
     known = {name: gender for name, gender in found.items() if gender not in ("", "unknown")}
     genders = sorted(set(known.values()))
@@ -151,7 +151,7 @@ def resolve_gender(
 
 
 def concatenate_params(parts: Sequence[BodyParams]) -> BodyParams:
-    """Join batched parameters along the batch axis, coefficients filled with zeros to one size."""
+    """Join batched parameters along the batch axis, padding coefficients with zeros."""
 
     def padded(part: BodyParams, name: str) -> Array:
         size = max(getattr(p, name).shape[-1] for p in parts)

@@ -21,7 +21,7 @@ from .capture import (
     resolve_gender,
     split_names,
 )
-from .prepared import find_subject, load_prepared
+from .scans import find_subject, ignored_meshes, load_prepared
 
 # AMASS keeps a subject's shape fit beside its motions.
 _NOT_MOTIONS = ("_stagei.npz", "shape.npz")
@@ -43,26 +43,26 @@ def load_grab(
     Three layouts are read: `DIR/train/*.npz` and `DIR/test/*.npz`; a subject's own folder of
     `*.npz`; and the folders the reference implementation prepares (see `load_prepared`). The
     archives are AMASS "SMPL-X G" or GRAB's own. The frames' meshes are the surface of the body,
-    posed when asked for; the z-up world of the files becomes y-up, with the translation turned
-    about the right pivot.
+    posed on access; the z-up world of the files becomes y-up.
 
     Args:
         data_dir: the folder.
         body: the body model of the subject's gender.
-        gender: takes the place of what the files say.
-        test: names of sequences to hold out, where the folder is not split.
-        split_seed: chooses the split otherwise: nine and three sequences, or 3:1 of fewer.
-        fps: resample to this frame rate; None keeps the files' own.
+        gender: overrides what the files state.
+        test: names of sequences to hold out, if the folder is not split.
+        split_seed: seed of the split otherwise: nine and three sequences, or 3:1 of fewer.
+        fps: resample to this frame rate. None keeps the rate of each file; they may differ.
         template: the subject's own template (GRAB's `vtemp`), vertices or a mesh file in the
             body's topology. It replaces template and shape: joints are regressed from it, and
-            betas are zero. None takes the one that GRAB's own archives name.
+            betas are zero. None for the template that GRAB's own archives name, if any.
         verbose: show a progress bar.
 
     Raises:
         FileNotFoundError: no such folder, no sequences, or no template where one is needed.
-        ValueError: as `load_motion`, or genders that do not match, or names not found.
+        ValueError: as for `load_motion`, scans that would be ignored, genders that do not match,
+            or names not found.
     """
-    data_dir = Path(data_dir)
+    data_dir = Path(data_dir).expanduser()
     files = find_motions(data_dir)
     subject = None if files else find_subject(data_dir)
     if subject is not None:
@@ -77,6 +77,7 @@ def load_grab(
     subject_gender, notices = resolve_gender(
         {m.source: m.gender for m in motions}, body, gender, data_dir
     )
+    notices += ignored_meshes(data_dir)
     template = _find_template(motions, data_dir) if template is None else template
     if template is not None:
         body = with_template(body, _template_vertices(template, body))
@@ -89,6 +90,10 @@ def load_grab(
     unused = sum(map(len, files.values())) - len(motions)
     if unused:
         recorded += (f"{data_dir}: {unused} sequences used neither for training nor for testing.",)
+    rates = sorted({motion.fps for motion in motions})
+    if len(rates) > 1:
+        listing = ", ".join(f"{rate:g}" for rate in rates)
+        recorded += (f"{data_dir}: frame rates of {listing}; each sequence keeps its own.",)
     names = [_name(file) for file in (*train_files, *test_files)]
     split = len(train_files)
     fitted = [fit_to_body(motion.to_y_up(body), body) for motion in motions]
@@ -106,13 +111,13 @@ def load_grab(
         test=test_frames,
         betas=np.asarray(train.params.betas[0], np.float64),
         gender=subject_gender,
-        fps=motions[0].fps,
+        fps=rates[0] if len(rates) == 1 else float("nan"),
         notices=recorded,
     )
 
 
 def find_motions(data_dir: Path) -> dict[str, list[Path]]:
-    """Motion archives by split: keys "train" and "test", or "" for a folder without a split."""
+    """Motion archives by split: "train" and "test", or "" for a folder without a split."""
     split = {part: _archives(data_dir / part) for part in ("train", "test")}
     if any(split.values()):
         return split
@@ -121,7 +126,7 @@ def find_motions(data_dir: Path) -> dict[str, list[Path]]:
 
 
 def _archives(folder: Path) -> list[Path]:
-    """Motion archives in a folder, leaving out parameters of single meshes beside them."""
+    """Motion archives in a folder, without the parameters of single meshes."""
     meshes = {p.stem for suffix in ("ply", "obj") for p in folder.glob(f"*.{suffix}")}
     return [
         p
@@ -158,15 +163,7 @@ def _load_motions(files: list[Path], fps: float | None, verbose: bool) -> list[M
 
     bar = tqdm(files, desc="reading sequences", unit="file", disable=None if verbose else True)
     motions = [load_motion(file) for file in bar]
-    if fps is not None:
-        return [motion.resample(fps) for motion in motions]
-    rates = {motion.fps for motion in motions}
-    if len(rates) > 1:
-        raise ValueError(
-            f"{files[0].parent}: sequences of different frame rates "
-            f"({', '.join(f'{r:g}' for r in sorted(rates))}); pass fps= to resample them."
-        )
-    return motions
+    return motions if fps is None else [motion.resample(fps) for motion in motions]
 
 
 def _find_template(motions: list[Motion], data_dir: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0: a skinned mesh with blend shapes and animation clips, through pygltflib."""
+"""Binary glTF 2.0 with pygltflib: a skinned mesh with blend shapes and animation clips."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import UInt8, UInt16
 
 from .._version import __version__
 from ..files import atomic_path
-from .influences import limit_influences
-from .rig import Clip, Rig, rotation_quaternions
+from .rig import Clip, Rig, limit_influences, rotation_quaternions
 
 Color = tuple[float, float, float]
-SKIN_COLOR_LINEAR: Color = (0.60, 0.40, 0.30)  # linear light, as glTF counts
+SKIN_COLOR_LINEAR: Color = (0.60, 0.40, 0.30)  # linear light, as in glTF
 _TYPES = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
 _VERTEX_DATA, _INDEX_DATA = 34962, 34963
 
@@ -25,18 +24,16 @@ def write_glb(
     rig: Rig,
     clips: Sequence[Clip] = (),
     *,
-    influences: Literal[4, 8] = 4,
+    influences: Literal[4, 8] | int = 4,
     base_color: Color = SKIN_COLOR_LINEAR,
 ) -> None:
     """Write a rig and its clips as one `.glb` file (glTF 2.0, section 3.7.3 on skins).
 
-    Metres, y up. `influences` bones a vertex: 8 go into a second set of attributes, which not
-    every program reads. `base_color` is what a mesh without colours gets, in linear light. The
-    file appears whole or not at all.
+    Metres, y up. `influences` is the number of bones per vertex; 8 need a second set of attributes,
+    which some programs ignore. `base_color` (linear light) is used for meshes without colours.
 
-    Raises:
-        ValueError: if clips do not fit the rig, or the name does not end in `.glb`.
-        OSError: if the file cannot be written; what stood there before stays.
+    **Raises:** `ValueError` if clips do not fit the rig, or the name does not end in `.glb`;
+    `OSError` if the file cannot be written; an existing file stays unchanged.
     """
     check_glb_path(path)
     data = glb_bytes(rig, clips, influences=influences, base_color=base_color)
@@ -47,38 +44,46 @@ def write_glb(
 def check_glb_path(path: str | os.PathLike[str]) -> None:
     """**Raises:** `ValueError` unless the name ends in `.glb`."""
     if not os.fspath(path).lower().endswith(".glb"):
-        raise ValueError(f"{os.fspath(path)}: binary glTF is written; let the name end in .glb")
+        raise ValueError(f"{os.fspath(path)}: binary glTF files end in .glb")
 
 
 def glb_bytes(
     rig: Rig,
     clips: Sequence[Clip] = (),
     *,
-    influences: Literal[4, 8] = 4,
+    influences: Literal[4, 8] | int = 4,
     base_color: Color = SKIN_COLOR_LINEAR,
 ) -> bytes:
-    """The contents of the file that `write_glb` writes."""
+    """Contents of the file that `write_glb` writes."""
     import pygltflib
 
     _check(rig, clips, influences)
     joints = rig.tree.num_joints
     store = _Store()
-    nodes = _joint_nodes(rig)
-    nodes.append(pygltflib.Node(name="avatar", mesh=0, skin=0))
+    inverse = np.linalg.inv(rig.bind)
+    inverse[:, 3] = (0, 0, 0, 1)  # the format requires it exactly
+    columns = inverse.transpose(0, 2, 1).astype("<f4")  # glTF stores columns
     skin = pygltflib.Skin(
         name="skeleton",
         joints=list(range(joints)),
         skeleton=0,
-        inverseBindMatrices=store.add(_inverse_bind(rig)),
+        inverseBindMatrices=store.add(columns),
+    )
+    color = base_color if rig.mesh.colors is None else (1.0, 1.0, 1.0)
+    material = pygltflib.Material(
+        name="avatar",
+        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
+            baseColorFactor=[*map(float, color), 1.0], metallicFactor=0.0, roughnessFactor=0.8
+        ),
     )
     gltf = pygltflib.GLTF2(
         asset=pygltflib.Asset(version="2.0", generator=f"xavatar_jax {__version__}"),
         scene=0,
         scenes=[pygltflib.Scene(nodes=[0, joints])],
-        nodes=nodes,
+        nodes=[*_joint_nodes(rig), pygltflib.Node(name="avatar", mesh=0, skin=0)],
         skins=[skin],
         meshes=[_mesh(rig, store, influences)],
-        materials=[_material(rig.mesh.colors is not None, base_color)],
+        materials=[material],
         animations=[_animation(rig, clip, store) for clip in clips],
         accessors=store.accessors,
         bufferViews=store.views,
@@ -90,7 +95,7 @@ def glb_bytes(
 
 
 class _Store:
-    """Arrays one after another in one buffer, each with its view and accessor."""
+    """Arrays in one buffer, each with its view and accessor."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -105,7 +110,7 @@ class _Store:
         bounds: bool = False,
         normalized: bool = False,
     ) -> int:
-        """Append an array, rows are elements; gives the number of its accessor."""
+        """Append an array of elements (rows) and return the number of its accessor."""
         import pygltflib
 
         array = np.ascontiguousarray(array)
@@ -137,10 +142,10 @@ class _Store:
 
 def _check(rig: Rig, clips: Sequence[Clip], influences: int) -> None:
     if influences not in (4, 8):
-        raise ValueError(f"{influences} influences a vertex; glTF takes sets of four: 4 or 8")
+        raise ValueError(f"{influences} influences per vertex; glTF has sets of four: use 4 or 8")
     names = [clip.name for clip in clips]
     if len(set(names)) < len(names):
-        raise ValueError(f"clips of the same name: {', '.join(names)}")
+        raise ValueError(f"clips have the same name: {', '.join(names)}")
     for clip in clips:
         found = (clip.rotations.shape[1], clip.coefficients.shape[1:])
         expected = (rig.tree.num_joints, (len(rig.target_names),))
@@ -167,12 +172,6 @@ def _joint_nodes(rig: Rig) -> list[Any]:
     ]
 
 
-def _inverse_bind(rig: Rig) -> Float[np.ndarray, "J 4 4"]:
-    inverse = np.linalg.inv(rig.bind)
-    inverse[:, 3] = (0, 0, 0, 1)  # not a rounding away from it: the format demands it exactly
-    return inverse.transpose(0, 2, 1).astype("<f4")  # glTF stores columns
-
-
 def _mesh(rig: Rig, store: _Store, influences: int) -> Any:
     import pygltflib
 
@@ -183,7 +182,7 @@ def _mesh(rig: Rig, store: _Store, influences: int) -> Any:
     if mesh.normals is not None:
         normals = mesh.normals.astype(np.float64)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        # A vertex of triangles without area has no direction: any unit vector is a valid one.
+        # Vertices of degenerate triangles have no normal; any unit vector is valid.
         normals = np.where(length > 0, normals / np.maximum(length, 1e-30), (0.0, 0.0, 1.0))
         attributes["NORMAL"] = store.add_vertices(normals.astype("<f4"))
     if mesh.colors is not None:
@@ -214,7 +213,7 @@ def _mesh(rig: Rig, store: _Store, influences: int) -> Any:
 
 
 def linear_colors(colors: UInt8[np.ndarray, "V C"]) -> UInt16[np.ndarray, "V 4"]:
-    """8-bit sRGB colours as 16-bit linear ones with opacity, which is how glTF blends them."""
+    """Convert 8-bit sRGB colours to 16-bit linear RGBA, as glTF defines vertex colours."""
     values = colors.astype(np.float64) / 255
     rgb = values[:, :3]
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
@@ -222,20 +221,8 @@ def linear_colors(colors: UInt8[np.ndarray, "V C"]) -> UInt16[np.ndarray, "V 4"]
     return np.round(65535 * np.concatenate([linear, alpha], axis=1)).astype(np.uint16)
 
 
-def _material(colored: bool, base_color: Color) -> Any:
-    import pygltflib
-
-    color = (1.0, 1.0, 1.0) if colored else base_color
-    return pygltflib.Material(
-        name="avatar",
-        pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
-            baseColorFactor=[*map(float, color), 1.0], metallicFactor=0.0, roughnessFactor=0.8
-        ),
-    )
-
-
 def _animation(rig: Rig, clip: Clip, store: _Store) -> Any:
-    """Rotations of all joints, translations of those that shift, coefficients of blend shapes."""
+    """Rotations of all joints, translations of moving joints, blend shape coefficients."""
     import pygltflib
 
     animation = pygltflib.Animation(name=clip.name)

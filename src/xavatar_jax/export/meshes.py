@@ -1,21 +1,24 @@
-"""PLY and OBJ files. Vertices keep their order and number in both directions."""
+"""PLY and OBJ files, and folders of them. Reading and writing keep the order of vertices."""
 
 import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..files import atomic_path
-from ..files.meshes import read_mesh as read_arrays
+from ..files import atomic_folder, atomic_path
+from ..files.meshes import read_colored_mesh
 from ..meshing import Mesh
+
+SequenceFormat = Literal["ply", "obj"]
+"""File formats of mesh sequences."""
 
 
 def write_ply(path: str | os.PathLike[str], mesh: Mesh) -> None:
-    """Write a binary PLY with float32 vertices, and normals and colours if the mesh has them.
+    """Write a binary PLY with float32 vertices, in metres, and normals and colours if present.
 
-    Metres in, metres out. The file appears whole or not at all.
-
-    Raises:
-        OSError: if the file cannot be written; what stood there before stays.
+    **Raises:** `OSError` if the file cannot be written; an existing file is kept.
     """
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     columns = [mesh.vertices.T]
@@ -49,13 +52,11 @@ def write_ply(path: str | os.PathLike[str], mesh: Mesh) -> None:
 
 
 def write_obj(path: str | os.PathLike[str], mesh: Mesh) -> None:
-    """Write an OBJ with vertices and faces, and normals if the mesh has them.
+    """Write an OBJ with vertices, faces, and normals and colours if present.
 
-    Colours follow the coordinates on the vertex lines, as MeshLab and Blender read them. The file
-    appears whole or not at all.
+    Colours follow the coordinates on vertex lines, which MeshLab and Blender read.
 
-    Raises:
-        OSError: if the file cannot be written; what stood there before stays.
+    **Raises:** `OSError` if the file cannot be written; an existing file is kept.
     """
     vertices, form = mesh.vertices, "v %.7g %.7g %.7g"
     if mesh.colors is not None:
@@ -72,27 +73,43 @@ def write_obj(path: str | os.PathLike[str], mesh: Mesh) -> None:
 
 
 def read_mesh(path: str | os.PathLike[str]) -> Mesh:
-    """Read a PLY (text or binary), OBJ or other mesh file; polygons become triangles.
+    """Read a PLY (text or binary, with vertex colours), OBJ or other mesh file.
 
-    Vertex colours are read from PLY files that have them.
+    Polygons are split into triangles.
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file holds no triangle mesh; the message names the file.
+    **Raises:** `FileNotFoundError` if there is no such file; `ValueError` naming the file if it
+    holds no triangle mesh.
     """
-    name = os.fspath(path)
-    vertices, faces = read_arrays(name)
-    return Mesh(vertices, faces, colors=_ply_colors(name, len(vertices)))
+    vertices, faces, colors = read_colored_mesh(os.fspath(path))
+    return Mesh(vertices, faces, colors=colors)
 
 
-def _ply_colors(path: str, count: int) -> np.ndarray | None:
-    """Vertex colours (V, 4) of a PLY file that has them."""
-    if not path.lower().endswith(".ply"):
-        return None
-    import trimesh
+def write_sequence(
+    folder: str | os.PathLike[str],
+    meshes: Iterable[Mesh],
+    count: int,
+    *,
+    format: SequenceFormat | str = "ply",
+    done: Callable[[int], Any] = lambda frames: None,
+) -> list[str]:
+    """Write `count` meshes (metres) into a new folder as `frame_0000.ply` and so on.
 
-    visual = trimesh.load_mesh(path, process=False, fix_texture=False).visual
-    if visual is None or visual.kind != "vertex":
-        return None
-    colors = np.asarray(visual.vertex_colors, dtype=np.uint8)  # pyright: ignore
-    return colors if colors.shape == (count, 4) else None
+    Returns their paths; calls `done(1)` after each frame. The folder appears when it is complete.
+
+    **Raises:** `FileExistsError` if `folder` exists; `ValueError` for an unknown format; `OSError`
+    if it cannot be written.
+    """
+    if format not in get_args(SequenceFormat):
+        raise ValueError(f"unknown format {format!r}: {', '.join(get_args(SequenceFormat))}")
+    target = Path(folder)
+    if target.exists():
+        raise FileExistsError(f"{target}: already exists; name a new folder, or remove this one")
+    write = {"ply": write_ply, "obj": write_obj}[format]
+    digits = max(4, len(str(count - 1)))
+    names = []
+    with atomic_folder(target) as temporary:
+        for k, mesh in enumerate(meshes):
+            names.append(f"frame_{k:0{digits}d}.{format}")
+            write(temporary / names[-1], mesh)
+            done(1)
+    return [str(target / name) for name in names]

@@ -10,6 +10,7 @@ stored one, and `covers` is false.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+from .roles import misshapen
 
 CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], np.int32)
 
@@ -58,12 +61,33 @@ class PartGrids(eqx.Module):
     blend_cells: Int[Array, "B 8"]
     blend_lerp: Float[Array, "B 8"]
     blend_share: Float[Array, " B"]
-    coarse_cells: int = eqx.field(static=True)
+    coarse_cells: Int[Array, ""]
 
     @property
     def num_nodes(self) -> int:
         """N, nodes of all grids together."""
         return self.nodes.shape[0]
+
+    def faults(self) -> Iterator[tuple[str, str]]:
+        """Leaves that do not fit one another: see `check_model`."""
+        cells, grids, blended = len(self.cells), len(self.origin), len(self.blend_nodes)
+        yield from misshapen(self, nodes=(None, 3), cells=(None, 8), covered=(cells,))
+        yield from misshapen(self, origin=(None, 3), spacing=(grids,), shape=(grids, 3))
+        yield from misshapen(self, offset=(grids,), coarse_cells=(), blend_nodes=(None,))
+        dense = np.asarray(self.shape, np.int64).prod(1)
+        yield from misshapen(self, index=(int(dense.sum()),))
+        yield from misshapen(self, blend_cells=(blended, 8), blend_lerp=(blended, 8))
+        yield from misshapen(self, blend_share=(blended,))
+        limits = {
+            **dict.fromkeys(("cells", "blend_nodes", "blend_cells"), self.num_nodes),
+            "index": cells,
+            "offset": int(dense.sum()),
+            "coarse_cells": cells + 1,
+        }
+        for name, limit in limits.items():
+            values = np.asarray(getattr(self, name))
+            if values.size and not (values.min() >= 0 and values.max() < limit):
+                yield name, f"values {values.min()} to {values.max()}, expected 0 to {limit - 1}"
 
     def locate(self, x: Float[Array, "*p 3"]) -> tuple[Array, Array, Array]:
         """Cell of each point, the position in it (0 to 1 an axis inside), and its spacing."""
@@ -76,7 +100,8 @@ class PartGrids(eqx.Module):
         u = (x - self.origin[grid].astype(x.dtype)) / spacing[..., None]
         shape = self.shape[grid]
         ijk = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
-        fraction = jnp.clip(u - ijk, 0, 1)
+        cell_low = ijk.astype(x.dtype)
+        fraction = jnp.clip(u - cell_low, 0, 1)
         flat = (ijk[..., 0] * shape[..., 1] + ijk[..., 1]) * shape[..., 2] + ijk[..., 2]
         cell = self.index[self.offset[grid] + flat]
         # Where a fine box leaves the answer to the coarse grid, the place is that in its cell.
@@ -84,15 +109,15 @@ class PartGrids(eqx.Module):
         # In floating point: vector code has no division of integers.
         ratio = jnp.round(self.spacing[0] / self.spacing).astype(x.dtype)[grid][..., None]
         share = 1 / ratio
-        first = ratio * jnp.floor((ijk + 0.5) * share)
-        fraction = jnp.where(coarse[..., None], (ijk - first + fraction) * share, fraction)
+        first = ratio * jnp.floor((cell_low + 0.5) * share)
+        fraction = jnp.where(coarse[..., None], (cell_low - first + fraction) * share, fraction)
         return cell, fraction, jnp.where(coarse, self.spacing[0].astype(x.dtype), spacing)
 
     def covers(self, x: Float[Array, "*p 3"]) -> Bool[Array, "*p"]:
         """Whether points lie in cells that store their nodes."""
         cell, _, _ = self.locate(x)
-        low = self.origin[0]
-        high = low + self.shape[0] * self.spacing[0]
+        low, spacing = self.origin[0].astype(x.dtype), self.spacing[0].astype(x.dtype)
+        high = low + self.shape[0].astype(x.dtype) * spacing
         return self.covered[cell] & jnp.all((x >= low) & (x <= high), axis=-1)
 
     def interpolate(
@@ -217,7 +242,7 @@ def _assemble(boxes: list, spacing: GridSpacing) -> PartGrids:
         blend_cells=jnp.asarray(margins.cells, jnp.int32),
         blend_lerp=margins.lerp,
         blend_share=jnp.asarray(margins.share, jnp.float32),
-        coarse_cells=coarse_cells,
+        coarse_cells=jnp.asarray(coarse_cells, jnp.int32),
     )
 
 
@@ -264,8 +289,8 @@ class _Margins(NamedTuple):
 
 
 def _margins(
-    nodes: list[Float[np.ndarray, "n 3"]],
-    depths: list[Float[np.ndarray, " n"]],
+    nodes: list[Float[np.ndarray, "_ 3"]],
+    depths: list[Float[np.ndarray, " _"]],
     boxes: list,
     cells: Int[np.ndarray, "C 8"],
     index: Int[np.ndarray, " dense"],

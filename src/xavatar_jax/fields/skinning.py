@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -12,7 +13,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..kinematics import KinematicTree, skin_points
 from .grids import CORNERS, PartGrids
 from .hierarchical import SOFT_BLEND, hierarchical_softmax, num_logits
-from .mlp import ImplicitMLP, MLPShape
+from .networks import ImplicitMLP, MLPShape
+from .roles import fixed, learned, misshapen, stored
 
 PAPER_SKINNING = MLPShape(width=128, depth=5, octaves=0, skip=(), condition_at=())
 """The paper's skinning network: five layers of 128, points as they are."""
@@ -64,10 +66,10 @@ class GridSkinning(AbstractSkinningField):
     joints from the mean shape's is a slowly varying offset: the correction needs few nodes.
     """
 
-    template: Float[Array, "N L"]
-    correction: Float[Array, "M L"]
-    grids: PartGrids
-    correction_grids: PartGrids
+    template: Float[Array, "N L"] = fixed()
+    correction: Float[Array, "M L"] = learned()
+    grids: PartGrids = fixed()
+    correction_grids: PartGrids = stored()
     tree: KinematicTree = eqx.field(static=True)
 
     def __call__(self, x_c: Float[Array, "3"]) -> Float[Array, " J"]:
@@ -78,6 +80,12 @@ class GridSkinning(AbstractSkinningField):
     def covers(self, x_c: Float[Array, "3"]) -> Array:
         return self.grids.covers(x_c)
 
+    def faults(self) -> Iterator[tuple[str, str]]:
+        """Leaves that do not fit one another: see `check_model`."""
+        logits = num_logits(self.tree)
+        yield from misshapen(self, template=(self.grids.num_nodes, logits))
+        yield from misshapen(self, correction=(self.correction_grids.num_nodes, logits))
+
 
 class TabulatedSkinning(AbstractSkinningField):
     """Weights on the nodes of part grids, read trilinearly.
@@ -87,7 +95,7 @@ class TabulatedSkinning(AbstractSkinningField):
     """
 
     node_weights: Float[Array, "N J"]
-    grids: PartGrids
+    grids: PartGrids = stored()
 
     def __call__(self, x_c: Float[Array, "3"]) -> Float[Array, " J"]:
         return self.grids.interpolate(self.node_weights, x_c)

@@ -11,15 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..body import (
-    FACES,
-    LEFT_HAND,
-    RIGHT_HAND,
     BodyModel,
     canonical_expression_dirs,
     canonical_vertices,
 )
 from ..geometry import closest_points
-from .expression import ExpressionGrid
+from .feature_grids import ExpressionGrid
 from .grids import GridSpacing, PartGrids, build_part_grids
 from .hierarchical import hierarchical_logits, num_logits
 from .skinning import GridSkinning
@@ -55,12 +52,10 @@ def body_part_grids(
     """Grids around canonical vertices: coarse everywhere, fine at both hands and the face."""
     return build_part_grids(
         vertices,
-        np.asarray(body.part_labels),
+        np.asarray(body.parts.labels),
         spacing,
         fine_parts={
-            "left_hand": ((LEFT_HAND,), spacing.hands),
-            "right_hand": ((RIGHT_HAND,), spacing.hands),
-            "face": (FACES, spacing.face),
+            name: (labels, getattr(spacing, region)) for name, region, labels in body.parts.pieces
         },
     )
 
@@ -83,7 +78,7 @@ def template_expression(
     On nodes around the canonical `vertices` of the face, by the closest point of the surface.
     None for a body without a face, or without expression.
     """
-    face = vertices[np.isin(np.asarray(body.part_labels), FACES)]
+    face = vertices[body.parts.mask("face")]
     if not len(face) or not num_expression:
         return None
     grid = ExpressionGrid(

@@ -1,4 +1,4 @@
-"""`Frames`: a lazy sequence of posed meshes with the body parameters of each."""
+"""Lazy sequences of posed meshes with the body parameters of each frame."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ..files.meshes import check_mesh, read_mesh
 from ..geometry import enclosed_volume
 
 LoadMesh = Callable[[int], tuple[np.ndarray, np.ndarray]]
-PartLabels = np.ndarray | Callable[[int], np.ndarray | None] | None
+PartLabels = np.ndarray | Callable[[int, np.ndarray], np.ndarray | None] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One posed mesh and the body parameters it was posed with.
 
@@ -27,9 +27,9 @@ class Frame:
         vertices: posed vertices, metres, in the world of `params`.
         faces: triangles as vertex indices.
         params: unbatched body parameters.
-        part_labels: index into `body.PARTS` for each vertex, or None where unknown.
-        source: where the frame comes from, for messages.
-        turned: whether the mesh was inside out, so that its triangles were turned round.
+        part_labels: part of the body for each vertex, or None if unknown.
+        source: name of the frame, for messages.
+        turned: whether the mesh was inside out and its triangles have been flipped.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -40,9 +40,9 @@ class Frame:
     turned: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Sources:
-    """What every view of one `Frames` shares: the loader and the names."""
+    """The loader and the names, shared by all views of one `Frames`."""
 
     load: LoadMesh
     part_labels: PartLabels
@@ -53,20 +53,21 @@ class _Sources:
 
 
 class Frames(Sequence[Frame]):
-    """A sequence of frames whose meshes are loaded one at a time, when asked for.
+    """A sequence of frames whose meshes are loaded one at a time, on access.
 
     `frames[3]` is a `Frame`; `frames[10:20]` and `frames[np.array([1, 5])]` are `Frames` that
     share the loader. No mesh is kept, so memory does not grow with the number of frames.
-    A mesh whose triangles face inwards is turned round, which its frame says (`turned`).
+    Triangles of a mesh that is inside out are flipped, and its frame says so (`turned`).
 
     Args:
         params: body parameters, batched over the N frames.
-        load: gives vertices (V, 3) and faces (F, 3) of frame `i`.
-        part_labels: labels (V,) shared by all frames, or a function of `i`, or None.
+        load: returns vertices (V, 3) and faces (F, 3) of frame `i`.
+        part_labels: labels (V,) shared by all frames, a function of `i` and the vertices of that
+            frame, or None.
         sources: a name for each frame, used in messages.
         sequence_names: names of the sequences the frames come from.
-        sequence_index: for each frame, which of `sequence_names` it belongs to.
-        body: the body that the parameters are for, where it is known.
+        sequence_index: index into `sequence_names` for each frame.
+        body: the body that the parameters are for, if known.
 
     Raises:
         ValueError: no frames, counts that do not match, or parameters that are not finite.
@@ -109,8 +110,7 @@ class Frames(Sequence[Frame]):
     ) -> Frames:
         """Frames from meshes: `(vertices, faces)` pairs, objects with both, or file paths.
 
-        Paths are read when a frame is asked for. `meshes` is indexed lazily, so a sequence that
-        makes its meshes on access stays lazy.
+        `meshes` is indexed, and paths are read, when a frame is accessed.
 
         Args:
             meshes: N meshes, vertices in metres.
@@ -118,7 +118,7 @@ class Frames(Sequence[Frame]):
             part_labels, sources, sequence_names, sequence_index, body: as for `Frames`.
 
         Raises:
-            ValueError: another number of meshes than of parameters, or as for `Frames`.
+            ValueError: the numbers of meshes and parameters differ, or as for `Frames`.
         """
         count = _batch_size(params)
         if len(meshes) != count:
@@ -140,7 +140,7 @@ class Frames(Sequence[Frame]):
 
     @property
     def body(self) -> BodyModel | None:
-        """The body that the parameters are for, or None where it was not given."""
+        """The body that the parameters are for, or None if it was not given."""
         return self._sources.body
 
     @property
@@ -150,17 +150,17 @@ class Frames(Sequence[Frame]):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Where each frame comes from."""
+        """The name of each frame."""
         return tuple(self._sources.names[i] for i in self._index)
 
     @property
     def sequence_names(self) -> tuple[str, ...]:
-        """Names that `sequence_index` refers to."""
+        """The names of the sequences."""
         return self._sources.sequence_names
 
     @property
     def sequence_index(self) -> Int[np.ndarray, " N"]:
-        """For each frame, the index of its sequence in `sequence_names`."""
+        """Index into `sequence_names` for each frame."""
         return self._sources.sequence_index[self._index]
 
     @property
@@ -171,19 +171,15 @@ class Frames(Sequence[Frame]):
         return {self.sequence_names[i]: self[np.flatnonzero(index == i)] for i in order}
 
     def with_params(self, params: BodyParams, body: BodyModel | None = None) -> Frames:
-        """The same meshes with other parameters, of another body.
+        """The same meshes with other parameters, for another body.
 
         Raises:
-            ValueError: another number of parameters than of frames, or some that are not finite.
+            ValueError: the numbers of parameters and frames differ, or some are not finite.
         """
         if _batch_size(params) != len(self):
             raise ValueError(f"parameters for {_batch_size(params)} frames; there are {len(self)}.")
         check_finite(params, self.sources)
-        view = object.__new__(Frames)
-        view._sources = replace(self._sources, body=body)
-        view._params = params
-        view._index = self._index
-        return view
+        return self._view(replace(self._sources, body=body), params, self._index)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -201,10 +197,12 @@ class Frames(Sequence[Frame]):
         positions = np.arange(len(self))[index if isinstance(index, slice) else np.asarray(index)]
         if positions.ndim != 1 or len(positions) == 0:
             raise ValueError(f"Selecting {index} from {len(self)} frames leaves no frames.")
+        return self._view(self._sources, _take(self._params, positions), self._index[positions])
+
+    @staticmethod
+    def _view(sources: _Sources, params: BodyParams, index: np.ndarray) -> Frames:
         view = object.__new__(Frames)
-        view._sources = self._sources
-        view._params = _take(self._params, positions)
-        view._index = self._index[positions]
+        view._sources, view._params, view._index = sources, params, index
         return view
 
     def _frame(self, position: int) -> Frame:
@@ -215,14 +213,16 @@ class Frames(Sequence[Frame]):
         vertices, faces = shared.load(i)
         vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
         check_mesh(vertices, faces, shared.names[i])
-        labels = shared.part_labels(i) if callable(shared.part_labels) else shared.part_labels
+        labels = shared.part_labels
+        if callable(labels):
+            labels = labels(i, vertices)
         if labels is not None and np.shape(labels) != (len(vertices),):
             raise ValueError(
                 f"{shared.names[i]}: part labels of shape {np.shape(labels)} for "
                 f"{len(vertices)} vertices; expected ({len(vertices)},)."
             )
         params = _take(self._params, position)
-        # Winding numbers decide what is inside, which need triangles that face outwards.
+        # Inside is decided by winding numbers, which need triangles that face outwards.
         turned = enclosed_volume(vertices, faces) < 0
         faces = faces[:, ::-1] if turned else faces
         return Frame(vertices, faces, params, labels, shared.names[i], turned)
@@ -265,7 +265,7 @@ def _batch_size(params: BodyParams) -> int:
     if len(set(counts.values())) != 1:
         raise ValueError(f"Parameters disagree on the number of frames: {counts}.")
     if counts["pose"] == 0:
-        raise ValueError("Parameters for 0 frames: there is nothing to make frames of.")
+        raise ValueError("Parameters for 0 frames; at least one frame is needed.")
     return counts["pose"]
 
 
@@ -299,13 +299,59 @@ def _as_vertices_and_faces(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def known_body(frames: Frames, body: BodyModel | None) -> BodyModel:
-    """The body given, or else that of the frames.
+    """`body`, or else the body of the frames.
 
-    **Raises:** `ValueError` if neither is there.
+    **Raises:** `ValueError` if neither is known.
     """
     body = frames.body if body is None else body
     if body is None:
-        raise ValueError(
-            "these frames do not say which body they are for: pass body=load_body(...)"
-        )
+        raise ValueError("the body of these frames is not known: pass body=load_body(...)")
     return body
+
+
+def spread(frames: Frames, n: int | None) -> Int[np.ndarray, " n"]:
+    """Sorted indices of `n` frames, spread evenly over the sequences and in time within each.
+
+    Sequences shorter than their share contribute all their frames, and the others contribute
+    more. Deterministic.
+
+    Args:
+        frames: frames of one or more sequences.
+        n: the number of frames; None, or more than there are, selects all.
+
+    Raises:
+        ValueError: `n` is less than 1.
+    """
+    if n is not None and n < 1:
+        raise ValueError(f"Cannot select {n} frames; at least 1 is needed.")
+    if n is None or n >= len(frames):
+        return np.arange(len(frames))
+    index = frames.sequence_index
+    groups = [np.flatnonzero(index == i) for i in dict.fromkeys(index.tolist())]
+    chosen = [
+        group[_evenly(len(group), quota)]
+        for group, quota in zip(groups, _quotas([len(g) for g in groups], n), strict=True)
+    ]
+    return np.sort(np.concatenate(chosen))
+
+
+def _quotas(sizes: list[int], n: int) -> list[int]:
+    """Share `n` among groups as equally as their sizes allow."""
+    quotas = [0] * len(sizes)
+    left = n
+    while left:
+        open_groups = [i for i, size in enumerate(sizes) if quotas[i] < size]
+        # Fewer than groups: choose groups spread over the list, not the first ones.
+        if left < len(open_groups):
+            open_groups = [open_groups[i] for i in _evenly(len(open_groups), left)]
+        share = max(left // len(open_groups), 1)
+        for i in open_groups:
+            given = min(share, sizes[i] - quotas[i])
+            quotas[i] += given
+            left -= given
+    return quotas
+
+
+def _evenly(size: int, n: int) -> np.ndarray:
+    """`n` distinct positions out of `size`: the centres of `n` equal intervals."""
+    return ((np.arange(n) + 0.5) * size / n).astype(np.int64)

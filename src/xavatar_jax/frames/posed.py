@@ -1,4 +1,4 @@
-"""Frames made by posing a body, and part labels read off a posed body."""
+"""Frames whose meshes are a posed body, and part labels from a posed body."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def frames_from_params(
     sequence_names: Sequence[str] = ("sequence",),
     sequence_index: Int[np.ndarray, " N"] | Sequence[int] | None = None,
 ) -> Frames:
-    """Frames whose meshes are the body itself, posed when a frame is asked for.
+    """Frames whose meshes are the body itself, posed on access.
 
     Args:
-        body: gives the surface and its part labels.
+        body: provides the surface and its part labels.
         params: parameters batched over the N frames.
         sources, sequence_names, sequence_index: as for `Frames`.
 
@@ -62,10 +62,10 @@ def frames_from_params(
 def nearest_part_labels(
     body: BodyModel, params: BodyParams, vertices: Float[np.ndarray, "V 3"]
 ) -> Int8[np.ndarray, " V"]:
-    """Part labels of any mesh: those of the nearest vertex of the body in the same pose.
+    """Part labels of any mesh, copied from the nearest vertex of the body in the same pose.
 
     Args:
-        body: gives the labels.
+        body: provides the labels.
         params: unbatched parameters of the mesh.
         vertices: metres, in the world of `params`.
     """

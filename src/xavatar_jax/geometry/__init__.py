@@ -1,12 +1,13 @@
-"""Queries on triangle meshes: winding numbers, closest points, normals, samples."""
+"""Queries on triangle meshes: closest points, winding numbers, normals, areas, samples."""
 
-from ._check import check_mesh as check_mesh
-from ._check import check_points as check_points
-from .libigl import ClosestPointTree as ClosestPointTree
-from .libigl import WindingNumberTree as WindingNumberTree
-from .libigl import closest_points as closest_points
-from .libigl import winding_number as winding_number
-from .nearest import nearest_vertices as nearest_vertices
+from .queries import ClosestPointTree as ClosestPointTree
+from .queries import VertexTree as VertexTree
+from .queries import WindingNumberTree as WindingNumberTree
+from .queries import closest_points as closest_points
+from .queries import nearest_vertices as nearest_vertices
+from .queries import winding_number as winding_number
+from .surface import check_mesh as check_mesh
+from .surface import check_points as check_points
 from .surface import corner_matrix as corner_matrix
 from .surface import enclosed_volume as enclosed_volume
 from .surface import face_areas as face_areas

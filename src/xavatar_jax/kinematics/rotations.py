@@ -1,23 +1,27 @@
-"""Axis-angle vectors and rotation matrices, with derivatives that are right at zero rotation."""
+"""Axis-angle vectors and rotation matrices, with correct derivatives at zero rotation."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])}
+"""Rotation about x that turns the given up axis ("y" in the SMPL family, "z" in AMASS) to y."""
 
 
 def axis_angle_to_matrix(rotation: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """Rodrigues' formula. `rotation` is axis times angle, in radians."""
+    """Rotation matrix of axis times angle (radians), by Rodrigues' formula."""
     x, y, z = rotation[..., 0], rotation[..., 1], rotation[..., 2]
     angle_sq = x * x + y * y + z * z
     small = angle_sq < 1e-4
-    # The branch not taken gets a harmless input: reverse mode differentiates both.
+    # A dummy input for the branch not taken, since reverse mode differentiates both.
     safe_sq = jnp.where(small, 1.0, angle_sq)
     angle = jnp.sqrt(safe_sq)
     sinc = jnp.where(
         small, 1 - angle_sq / 6 + angle_sq**2 / 120 - angle_sq**3 / 5040, jnp.sin(angle) / angle
     )
-    # 1 - cos as twice a squared sine: no cancellation at small angles.
+    # 1 - cos as twice a squared sine avoids cancellation at small angles.
     cosc = jnp.where(
         small,
         0.5 - angle_sq / 24 + angle_sq**2 / 720 - angle_sq**3 / 40320,
@@ -34,8 +38,8 @@ def axis_angle_to_matrix(rotation: Float[Array, "*batch 3"]) -> Float[Array, "*b
 def matrix_to_axis_angle(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
     """The inverse of `axis_angle_to_matrix`, with angles in [0, pi].
 
-    Goes through the quaternion whose largest component is divided by, so that it is accurate at
-    every angle, pi included (Shepperd, 1978).
+    Uses the quaternion divided by its largest component, which is accurate at every angle
+    including pi (Shepperd, 1978).
     """
     m = matrix
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

@@ -1,4 +1,4 @@
-"""The tree of joints: names and parents, known when tracing."""
+"""Joint names and parents, static under `jit`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class KinematicTree:
-    """Joint names and parent indices. The root comes first, with parent -1.
+    """Joint names and parent indices, hashable. The root comes first, with parent -1.
 
-    Hashable and static: code that walks the tree walks it when tracing, one level at a time.
-
-    **Raises:** `ValueError` if a parent does not stand before its child, names repeat, or there
-    is not exactly one root.
+    **Raises:** `ValueError` if a parent does not come before its child, names repeat, or there is
+    not exactly one root.
     """
 
     names: tuple[str, ...]
@@ -31,17 +29,17 @@ class KinematicTree:
             if not 0 <= parent < joint:
                 raise ValueError(
                     f"joint {joint} ({self.names[joint]}) has parent {parent}; "
-                    f"a parent must stand before its child, and only joint 0 is a root"
+                    f"parents must come before their children, and only joint 0 is a root"
                 )
 
     @property
     def num_joints(self) -> int:
-        """J, joints of the tree."""
+        """J, the number of joints."""
         return len(self.parents)
 
     @cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Joints by their distance from the root."""
+        """Joints grouped by their depth in the tree."""
         depth = [0] * self.num_joints
         for joint, parent in enumerate(self.parents[1:], start=1):
             depth[joint] = depth[parent] + 1
@@ -49,19 +47,12 @@ class KinematicTree:
             tuple(j for j in range(self.num_joints) if depth[j] == d) for d in range(max(depth) + 1)
         )
 
-    @cached_property
-    def _children(self) -> tuple[tuple[int, ...], ...]:
-        return tuple(
-            tuple(k for k, parent in enumerate(self.parents) if parent == j)
-            for j in range(self.num_joints)
-        )
-
     def children(self, joint: int) -> tuple[int, ...]:
-        """The joints whose parent this one is, in index order."""
-        return self._children[joint]
+        """The joints with this parent, in index order."""
+        return tuple(k for k, parent in enumerate(self.parents) if parent == joint)
 
     def subtree(self, joint: int) -> tuple[int, ...]:
-        """The joint and everything below it, in index order."""
+        """The joint and its descendants, in index order."""
         members = {joint}
         for k in range(joint + 1, self.num_joints):
             if self.parents[k] in members:
@@ -69,12 +60,12 @@ class KinematicTree:
         return tuple(sorted(members))
 
     def index(self, name: str) -> int:
-        """**Raises:** `KeyError` listing the names there are."""
+        """Index of a joint. **Raises:** `KeyError` listing the names."""
         try:
             return self.names.index(name)
         except ValueError:
             raise KeyError(f"no joint {name!r}; the tree has {', '.join(self.names)}") from None
 
     def indices(self, *names: str) -> tuple[int, ...]:
-        """Indices of those of `names` that the tree has."""
+        """Indices of the given names; names that the tree lacks are skipped."""
         return tuple(self.names.index(name) for name in names if name in self.names)

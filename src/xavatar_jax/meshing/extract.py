@@ -1,4 +1,4 @@
-"""Extraction of a field's level set, coarse to fine, with cells that may differ by place."""
+"""Extract a level set of a field, coarse to fine, with cell sizes that may vary in space."""
 
 import math
 from collections.abc import Callable
@@ -9,11 +9,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..geometry import check_points
-from .contour import dual_polygons, triangulate
+from .dual_contour import dual_polygons, triangulate
 from .mesh import Mesh
 from .octree import Octree, refine, root_octree
-from .place import place_between, spread_and_project
 from .sampler import EmptyLevelSetError, FieldSampler, ScalarField, VectorField
+from .vertex_placement import place_between, spread_and_project
 
 _MAX_COARSE, _MAX_LEAVES = 100_000, 20_000_000
 
@@ -37,32 +37,31 @@ def extract_surface(
 ) -> Mesh:
     """Extract the surface where `field` crosses `level`, as a closed manifold facing outwards.
 
-    An octree over `bounds` is refined only where the field changes sign and contoured on its dual
-    grid, so no fine grid is ever held and neighbouring cells of different size leave no crack.
-    The surface is followed from where it is found; a separate piece is found if a coarse cell's
-    centre lies in it, or if a seed does. A surface that reaches the bounds is closed there.
+    An octree over `bounds` is refined only where the field changes sign, and contoured on its dual
+    grid: no fine grid is stored, and cells of different size leave no cracks. The surface is
+    followed from where it is found; a separate piece is found if it contains the centre of a
+    coarse cell or a seed. A surface that reaches the bounds is closed there.
 
     Args:
         field: batched scalar field, positive inside, from (batch_points, 3) float32 metres to
-            (batch_points,). It is always called with exactly `batch_points` rows, by two threads
-            at a time.
+            (batch_points,). Every call has exactly `batch_points` rows; two threads call it.
         bounds: lowest and highest corner (2, 3), metres.
         cell: edge of the finest cells, metres.
-        cell_at: wanted edge of the cells at points (N, 3), metres. Edges used are `cell` times a
-            power of two, the largest not above what is wanted. Default: `cell` everywhere.
+        cell_at: wanted edge of the cells at points (N, 3), metres, rounded down to `cell` times a
+            power of two. Default: `cell` everywhere.
         level: value at the surface.
-        coarse_cell: edge of the cells that the search for the surface starts from, metres; at
-            most about half of the thinnest part that no seed marks. Default: `cell`, doubled
+        coarse_cell: edge of the cells in which the search for the surface starts, metres; at most
+            about half of the thinnest part without seeds. Default: `cell`, doubled
             until the first grid has at most 100,000 points.
-        seeds: points (S, 3) near the surface, such as a template's vertices, around which cells
+        seeds: points (S, 3) near the surface, such as the vertices of a template. Cells around them
             are refined to twice their final size in any case.
         gradient: batched gradient of the field, (batch_points, 3) to (batch_points, 3), for
-            `normals`. Default: finite differences, four evaluations a gradient.
+            `normals`. Default: finite differences with four evaluations.
         batch_points: rows in every call of `field` and `gradient`.
-        max_vertices: if more vertices would come out, all cells grow by what is needed.
+        max_vertices: if there would be more vertices, all cells are enlarged as needed.
         edge_steps: evaluations that place each vertex on its edge of the dual grid.
-        project_steps: rounds that even out the triangles and put the vertices back on the level
-            set; a vertex never ends more than a cell from its place on the edge.
+        project_steps: rounds that even out the triangles and return the vertices to the level set;
+            they stay within a cell of their place on the edge.
         normals: also store unit normals from the field's gradient.
         verbose: show a progress bar.
 
@@ -94,8 +93,8 @@ def extract_surface(
     try:
         while True:
             tree, pairs = _refined(sampler, cell, scale, cell_at, coarse_cell, seeds)
-            # A pair of leaves makes one vertex, so the count is known before any is placed, but
-            # for the few in the middle of crowded polygons.
+            # Each pair of leaves gives one vertex, so the count is known before any is placed,
+            # except for the few in the middle of crowded polygons.
             count = len(pairs)
             if max_vertices is None or count <= max_vertices:
                 mesh = _contoured(tree, pairs, sampler, edge_steps, project_steps, normals)
@@ -147,7 +146,7 @@ def _refined(
         wanted = np.asarray(cell_at(points), dtype=np.float64)
         if wanted.shape != (len(points),) or not (wanted > 0).all():
             raise ValueError(
-                f"cell_at must answer {len(points)} points with positive lengths of shape "
+                f"cell_at must return positive lengths for {len(points)} points, with shape "
                 f"({len(points)},), found shape {wanted.shape}."
             )
         steps = np.floor(np.log2(wanted / cell) + 1e-6)
@@ -158,7 +157,7 @@ def _refined(
     if len(pairs) == 0 or sampler.lowest > 0:
         where = (
             f"between {sampler.bounds[0].tolist()} and {sampler.bounds[1].tolist()} m: the "
-            f"{sampler.count} values seen, less the level, range from {sampler.lowest:.4g} to "
+            f"{sampler.count} values sampled, minus the level, range from {sampler.lowest:.4g} to "
             f"{sampler.highest:.4g}"
         )
         advice = (

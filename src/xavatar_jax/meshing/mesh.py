@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped
 
 from ..geometry import check_mesh, enclosed_volume, face_areas, vertex_normals
 
@@ -24,8 +24,9 @@ class Mesh:
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
-    normals: Float[np.ndarray, "V 3"] | None = None
-    colors: UInt8[np.ndarray, "V C"] | None = None
+    # "_": `__post_init__` compares the counts, and names the array.
+    normals: Float[np.ndarray, "_ 3"] | None = None
+    colors: Shaped[np.ndarray, "_ C"] | None = None
 
     def __post_init__(self) -> None:
         vertices = np.asarray(self.vertices)

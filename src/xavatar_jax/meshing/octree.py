@@ -14,7 +14,7 @@ _NUMBERS = np.arange(8, dtype=np.int32)
 _AXES = np.repeat(np.arange(3), 2)
 _SIDES = np.tile([1, 0], 3)
 
-# Nodes, a face of each, and the nodes across it: three arrays of one length.
+# Nodes, a face of each, and the nodes across it: arrays of equal length.
 Meeting = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -65,7 +65,7 @@ class Octree:
     ) -> Int[np.ndarray, "M"]:
         """The leaf that holds each finest lattice cell; cells outside clamp to the border.
 
-        Where the leaf is of a level below `least`, the node of that level is given.
+        Where the level of the leaf is below `least`, the ancestor at that level is returned.
         """
         lattice = np.clip(lattice, 0, ((self.shape << self.depth) - 1).astype(lattice.dtype))
         root = lattice >> self.depth
@@ -93,14 +93,14 @@ class Octree:
         return children
 
     def crossed(self, nodes: Int[np.ndarray, "M"]) -> Bool[np.ndarray, "M"]:
-        """Whether the field has another sign at a known corner than at the centre."""
+        """Whether the field differs in sign between a known corner and the centre."""
         return np.any(self.corner_signs[nodes] * _signs(self.value[nodes])[:, None] < 0, axis=1)
 
     def _children_signs(self, nodes: Int[np.ndarray, "M"]) -> Int[np.ndarray, "M8 2"]:
-        """What is known of the corners of the children of `nodes`.
+        """Known corner signs of the children of `nodes`.
 
-        Each child touches its parent's centre. The children at the parent's own known corners
-        keep those too: what a coarse sample has seen is not forgotten when finer ones miss it.
+        Each child touches its parent's centre. The children at the parent's known corners inherit
+        those too: what a coarse sample has seen is kept even if finer samples miss it.
         """
         signs = np.zeros((len(nodes), 8, 2), dtype=np.int8)
         signs[:, :, 0] = _signs(self.value[nodes])[:, None]
@@ -141,13 +141,13 @@ def refine(
     seeds: Float[np.ndarray, "S 3"] | None,
     max_leaves: int,
 ) -> Int[np.ndarray, "K 2"]:
-    """Split leaves until the surface meets only leaves of the size wanted.
+    """Split leaves until all leaves at the surface have the wanted size.
 
-    A leaf coarser than wanted is split if a face neighbour, or one of its own corners where the
-    field is known, has the other sign; and any leaf if such a neighbour is less than half its
-    size. New leaves are compared with their neighbours again, so the surface is followed into
-    parts that the roots did not see. The leaf of a seed and the leaves beside it are split
-    down to twice the size wanted there, whatever the signs.
+    A leaf coarser than wanted is split if a face neighbour or one of its known corners has the
+    other sign; any leaf is split if such a neighbour is less than half its size. New leaves are
+    compared with their neighbours again, so the surface is followed into parts that the roots
+    missed. The leaf of a seed and the leaves next to it are split down to twice the size wanted
+    there, whatever the signs.
 
     Returns the face-adjacent leaf pairs of opposite sign, finer leaf first: (K, 2).
     """
@@ -174,7 +174,7 @@ def refine(
             hanging.append((leaf[coarser], face[coarser], other[coarser]))
             crossed = np.flatnonzero(inside[leaf] != inside[other])
             leaf, other, own, level = leaf[crossed], other[crossed], own[crossed], level[crossed]
-            # Seen from the finer side, or once if both are of one size.
+            # From the finer side, or once if both have one size.
             once = (level > own) | ((level == own) & (leaf < other) & ~split[other])
             crossings.append(np.stack([leaf[once], other[once]], axis=1))
         hanging_leaf, hanging_face, hanging_other = (
@@ -200,7 +200,7 @@ def refine(
         if len(tree.level) + 8 * len(flagged) > max_leaves:
             raise ValueError(
                 f"meshing at cells of {tree.cell:g} m needs more than {max_leaves} octree nodes: "
-                "use a larger cell, or check that the field is not noise."
+                "use a larger cell, or check whether the field is noise."
             )
         new = tree.split(flagged, sampler)
         wanted = np.concatenate([wanted, np.full(len(new), -1, dtype=np.int8)])
@@ -218,7 +218,7 @@ def _meetings_of_roots(tree: Octree) -> Iterator[Meeting]:
 def _meetings_of_children(tree: Octree, parents: Int[np.ndarray, "M"]) -> Iterator[Meeting]:
     """Children of nodes just split, a face of each, and what is across: no finer, or split itself.
 
-    Siblings meet once. Across a parent's face one look serves its four children there.
+    Siblings meet once. One look-up across a parent's face serves its four children there.
     """
     first = tree.first_child[parents]
     level = tree.level[parents]
@@ -261,9 +261,9 @@ def _across(
     face: Int[np.ndarray, "M"],
     least: Int[np.ndarray, "M"] | int = 0,
 ) -> Int[np.ndarray, "M"]:
-    """The leaf on the other side of a leaf's face, or one of them; no finer than level `least`.
+    """A leaf on the other side of a leaf's face, no finer than level `least`.
 
-    At the border it is the leaf itself.
+    At the border this is the leaf itself.
     """
     probe = tree.corner[leaf]
     size = 1 << tree.level[leaf].astype(np.int32)

@@ -1,6 +1,7 @@
-"""Evaluation of a field in batches of one fixed size, so that a jitted field never retraces."""
+"""Evaluate a field in batches of one fixed size, so that a jitted field never retraces."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from threading import Lock
 
 import numpy as np
@@ -11,15 +12,15 @@ VectorField = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N 3"]]
 
 
 class EmptyLevelSetError(ValueError):
-    """The field has no surface at the level asked for, within the bounds asked for."""
+    """The field has no surface at the given level within the given bounds."""
 
 
 class FieldSampler:
     """Calls a field on float32 batches of exactly `batch_points` rows, padding the last.
 
-    Values are relative to `level`; outside `bounds` the sampler answers "outside" by itself, so
-    that every surface is closed at the bounds. It keeps the range of values and a count. More
-    than one thread may call it if the field allows.
+    Values are relative to `level`. Points beyond `bounds` count as outside without a call, so
+    that every surface is closed at the bounds. The sampler records the range and the number of
+    values. Several threads may call it if the field allows that.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class FieldSampler:
 
     @property
     def block_rows(self) -> int:
-        """Rows of a block of work of which few are padding in the end."""
+        """Block size for `in_blocks` that wastes few rows on padding."""
         return 4 * self._batch
 
     def __call__(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
@@ -65,7 +66,7 @@ class FieldSampler:
             with self._lock:
                 self.lowest = min(self.lowest, float(values.min()))
                 self.highest = max(self.highest, float(values.max()))
-        # An exact zero has no side. Outside it is, by the smallest amount that still divides.
+        # An exact zero has no side: count it as outside, by the smallest number that still divides.
         values[values == 0] = -np.finfo(np.float32).tiny
         if every:
             return values
@@ -81,17 +82,17 @@ class FieldSampler:
     def gradient(
         self, points: Float[np.ndarray, "N 3"], step: Float[np.ndarray, "N"]
     ) -> Float[np.ndarray, "N 3"]:
-        """Gradient by the callable given, else by differences over `step` (N,), metres."""
+        """Gradient from the given callable, or by differences over `step` (N,), metres."""
         if self._gradient is not None:
             return self._run(self._gradient, points, (3,)).astype(np.float64)
-        # Four corners of a tetrahedron: a second-order gradient for four evaluations.
+        # Corners of a tetrahedron: a second-order gradient from four evaluations.
         corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
         probes = points[:, None] + step[:, None, None] * corners
         values = self._run(self._field, probes.reshape(-1, 3), ()).astype(np.float64)
         return values.reshape(-1, 4) @ corners / (4.0 * step[:, None])
 
     def _run(self, function: Callable, points: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Call `function` batch by batch and check what it answers."""
+        """Call `function` batch by batch and check what it returns."""
         results = np.empty((len(points), *shape), dtype=np.float32)
         for start in range(0, len(points), self._batch):
             part = np.asarray(points[start : start + self._batch], dtype=np.float32)
@@ -101,8 +102,8 @@ class FieldSampler:
             answer = np.asarray(function(part))
             if answer.shape != (self._batch, *shape):
                 raise ValueError(
-                    f"the {'gradient' if shape else 'field'} must answer points of shape "
-                    f"({self._batch}, 3) with shape {(self._batch, *shape)}, found {answer.shape}."
+                    f"the {'gradient' if shape else 'field'} must return {self._batch} values "
+                    f"with shape {(self._batch, *shape)}, found {answer.shape}."
                 )
             results[start : start + rows] = answer[:rows]
             with self._lock:
@@ -114,6 +115,21 @@ class FieldSampler:
             first = np.asarray(points)[bad][0]
             raise ValueError(
                 f"the field is not finite at {int(bad.sum())} of {len(points)} points, first at "
-                f"{first.tolist()}: check the weights that it was made from."
+                f"{first.tolist()}: check the weights of the field."
             )
         return results
+
+
+def in_blocks(
+    work: Callable[[slice], tuple[np.ndarray, ...]], count: int, rows: int
+) -> tuple[np.ndarray, ...]:
+    """Apply `work` to slices of `rows` of `count` rows; concatenate the arrays in order.
+
+    Uses two threads: NumPy and compiled fields release the interpreter lock most of the time.
+    """
+    if count <= rows:
+        return work(slice(0, count))
+    slices = [slice(start, min(start + rows, count)) for start in range(0, count, rows)]
+    with ThreadPoolExecutor(2) as pool:
+        parts = pool.map(work, slices)
+        return tuple(np.concatenate(part) for part in zip(*parts, strict=True))

@@ -1,6 +1,6 @@
-"""Distances, normals and overlap between a mesh and the truth: whole, hands and face."""
+"""Distances, normals and overlap of a mesh and the ground truth: all, hands and face."""
 
-from .evaluate import surface_metrics as surface_metrics
+from .compare import surface_metrics as surface_metrics
 from .record import REGIONS as REGIONS
 from .record import MeshMetrics as MeshMetrics
 from .record import RegionValues as RegionValues

@@ -15,9 +15,8 @@ import numpy as np
 
 from ..body import SMPLH_TREE, SMPLX_TREE
 from ..files import atomic_path
-from .convert import MotionNotice
 from .format import DEFAULT_FPS, Format, ReadOptions, Source
-from .record import Motion
+from .record import Motion, MotionNotice
 from .values import (
     Side,
     absolute_hands,
@@ -144,8 +143,8 @@ def _writing_notices(motion: Motion, gender: str, foreign_shape: bool) -> list[s
         notices.append(f"the template {motion.template} is not in the archive")
     if int(motion.fps) < DEFAULT_FPS or motion.fps != int(motion.fps):
         notices.append(
-            f"{motion.fps:g} frames a second: Blender's add-ons cut the rate to a whole number and "
-            f"refuse one below their target, {DEFAULT_FPS:g} unless set; use motion.resample"
+            f"{motion.fps:g} frames per second: Blender's add-ons cut the rate to a whole number "
+            f"and refuse one below their target, {DEFAULT_FPS:g} unless set; use motion.resample"
         )
     return notices
 

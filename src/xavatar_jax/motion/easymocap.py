@@ -8,20 +8,18 @@ and relative to the mean hand, unless all joints are given.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..body import SMPL_TREE, SMPLH_TREE, SMPLX_TREE, BodyModel
+from ..files import load_json
 from ..kinematics import KinematicTree
-from .format import BODY_ONLY, Format, ReadOptions, Source
+from .editing import fill_gaps
+from .format import BODY_ONLY, Format, ReadOptions, Source, choose_person
 from .params import numbered
-from .people import choose_person
-from .record import Motion
-from .resampling import fill_gaps
-from .rotate import rest_pelvis
+from .record import Motion, rest_pelvis
 from .values import Side, absolute_hands, one_shape, per_frame, rotation_vectors
 
 _PATTERN = r"(\d+)\.json"
@@ -45,19 +43,12 @@ def _people(data: Any) -> list[dict[str, Any]]:
     return people if fits else []
 
 
-def _load(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not readable JSON ({error}).") from None
-
-
 def _recognise(source: Source) -> bool:
     if source.kind == "json":
         return bool(_people(source.data))
     # A frame may hold nobody: the first that holds something decides.
     for paths in numbered(source, _PATTERN, _FOLDERS).values():
-        data = _load(paths[0])
+        data = load_json(paths[0])
         if data:
             return bool(_people(data))
     return False
@@ -68,7 +59,7 @@ def _read(source: Source, options: ReadOptions) -> Motion:
         documents = {0: (source.path, source.data)}
     else:
         files = numbered(source, _PATTERN, _FOLDERS)
-        documents = {n: (paths[0], _load(paths[0])) for n, paths in files.items()}
+        documents = {n: (paths[0], load_json(paths[0])) for n, paths in files.items()}
     people: dict[int, dict[int, tuple[Path, dict[str, Any]]]] = {}
     for number, (path, data) in documents.items():
         for entry in _people(data):

@@ -1,59 +1,33 @@
-"""Cutting motions and joining them."""
+"""Joining motions, filling missing frames, and motions in camera axes."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .convert import MotionNotice
-from .resampling import slerp
-
-if TYPE_CHECKING:
-    from .record import Motion
-
-
-def trim(motion: Motion, start: float = 0.0, end: float | None = None) -> Motion:
-    """The frames from `start` to `end`, both included, in seconds from the first frame.
-
-    Args:
-        motion: the motion.
-        start, end: seconds; None is the end of the motion.
-
-    Raises:
-        ValueError: no frame lies between them.
-    """
-    last = motion.seconds if end is None else end
-    # A frame that rounding puts just outside counts as inside.
-    places = np.arange(len(motion))
-    inside = (places >= start * motion.fps - 1e-6) & (places <= last * motion.fps + 1e-6)
-    if not inside.any():
-        raise ValueError(
-            f"{motion.source}: no frame between {start:g} and {last:g} seconds; the motion runs "
-            f"from 0 to {motion.seconds:g}."
-        )
-    kept = np.flatnonzero(inside)
-    return motion[int(kept[0]) : int(kept[-1]) + 1]
+from ..body import BodyModel
+from .record import Motion, MotionNotice, pelvis_of
+from .rotations import interpolate
 
 
 def concat(motions: Sequence[Motion], *, blend: float = 0.0, follow: bool = False) -> Motion:
-    """Motions one after another, each faded into the next.
+    """Join motions one after another, each faded into the next.
 
-    For `blend` seconds two motions run at once: rotations go from the one to the other along the
-    shortest arc, translation and expression in a straight line, all with a weight that starts and
-    ends at rest. Without a blend the second begins a frame after the first has ended.
+    During a blend both motions run at once: rotations are interpolated along the shortest arc,
+    translation and expression linearly, with a weight that starts and ends at rest. Without a
+    blend the second motion begins one frame after the first has ended.
 
     Args:
         motions: with the same joints, frame rate and up axis.
         blend: seconds that neighbours share.
-        follow: move each motion over the ground so that it starts where the one before it is,
-            instead of sliding there. Height and direction are kept.
+        follow: move each motion over the ground so that it starts where the previous one ends.
+            Height and direction are kept.
 
     Raises:
-        ValueError: nothing to join, motions that do not match, or shorter than the blend.
+        ValueError: no motions, motions that do not match, or one shorter than the blend.
     """
     if not motions:
         raise ValueError("No motions to join.")
@@ -79,7 +53,7 @@ def _check_match(first: Motion, other: Motion) -> None:
         raise ValueError(f"{other.source} has other joints than {first.source}.")
     if other.fps != first.fps:
         raise ValueError(
-            f"{other.source} runs at {other.fps:g} frames a second and {first.source} at "
+            f"{other.source} has {other.fps:g} frames per second and {first.source} "
             f"{first.fps:g}; resample one."
         )
     if other.up != first.up:
@@ -108,12 +82,12 @@ def _join(first: Motion, second: Motion, shared: int, follow: bool) -> Motion:
         mixed = (1 - weight[:, None]) * a[kept:] + weight[:, None] * b[:shared]
         return np.concatenate([a[:kept], mixed, b[shared:]])
 
-    mixed = slerp(first.poses[kept:], second.poses[:shared], weight) if shared else None
+    mixed = interpolate(first.poses[kept:], second.poses[:shared], weight) if shared else None
     parts = [first.poses[:kept], *([] if mixed is None else [mixed]), second.poses[shared:]]
     notices = tuple(dict.fromkeys((*first.notices, *second.notices)))
-    mine, other = (np.trim_zeros(m.betas, "b") for m in (first, second))
-    if not np.array_equal(mine, other):
-        notice = f"{second.source}: another shape than {first.source}; the first one's is used."
+    one, other = (np.trim_zeros(m.betas, "b") for m in (first, second))
+    if not np.array_equal(one, other):
+        notice = f"{second.source}: its shape differs from that of {first.source}, which is used."
         warnings.warn(notice, MotionNotice, stacklevel=4)
         notices += (notice,)
     return replace(
@@ -123,4 +97,72 @@ def _join(first: Motion, second: Motion, shared: int, follow: bool) -> Motion:
         expression=linear(expression(first), expression(second)),
         source=f"{first.source} + {second.source}",
         notices=notices,
+    )
+
+
+def fill_gaps(motion: Motion, numbers: Sequence[int]) -> Motion:
+    """Place frames by their numbers and interpolate missing ones, with a notice.
+
+    Numbers that rise by a constant step are taken as consecutive.
+
+    Args:
+        motion: the frames that were found.
+        numbers: the number of each frame, rising.
+
+    Raises:
+        ValueError: the numbers do not rise, or more than nine tenths of the frames are missing.
+    """
+    found = np.asarray(numbers, np.int64)
+    steps = np.diff(found)
+    if steps.size and steps.min() < 1:
+        raise ValueError(f"{motion.source}: frame numbers {_listed(found)} do not rise.")
+    if not steps.size or steps.max() == 1:
+        return motion
+    step = int(np.gcd.reduce(steps))
+    places = (found - found[0]) // step
+    if step > 1:
+        motion = motion.with_notice(
+            f"{motion.source}: frames are numbered in steps of {step}; they are taken as "
+            f"consecutive at {motion.fps:g} frames per second."
+        )
+    count = int(places[-1]) + 1
+    missing = count - len(found)
+    if not missing:
+        return motion
+    if missing > 9 * len(found):
+        raise ValueError(
+            f"{motion.source}: {len(found)} frames are numbered {_listed(found)}, so {missing} "
+            "are missing between them; keep the files of one clip."
+        )
+    longest = int(np.diff(places).max()) - 1
+    position = np.interp(np.arange(count), places, np.arange(len(found)))
+    return motion.sampled(position, motion.fps).with_notice(
+        f"{motion.source}: {missing} of {count} frames are missing, up to {longest} in a row; "
+        "they are interpolated."
+    )
+
+
+def _listed(numbers: np.ndarray) -> str:
+    shown = ", ".join(map(str, numbers[:6]))
+    return f"{shown}, ..., {numbers[-1]}" if len(numbers) > 6 else shown
+
+
+def from_camera(motion: Motion, body: BodyModel | None) -> Motion:
+    """Turn a motion from OpenCV camera axes (x right, y down, z forward) to a y-up world.
+
+    Without a body the world turns about a pelvis at the origin, which moves the whole motion by a
+    constant; a notice says so. A motion without translation keeps none.
+
+    Args:
+        motion: in camera axes.
+        body: gives the pelvis to turn about.
+    """
+    turn = np.diag([1.0, -1.0, -1.0])
+    if not motion.transl.any():
+        return replace(motion.rotate(turn, np.zeros(3), up="y"), transl=motion.transl)
+    if body is not None:
+        return motion.rotate(turn, pelvis_of(motion, body), up="y")
+    return motion.rotate(turn, np.zeros(3), up="y").with_notice(
+        f"{motion.source}: turned y-up without a body, so the whole motion is displaced by a "
+        "constant of a few decimetres; pass body= for the exact position."
     )

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ..body import BodyModel
-from ..files import load_npz, load_pickle
+from ..files import is_torch, load_json, load_npy, load_npz, load_pickle, load_torch
+from .record import Motion, UpAxis
 
-if TYPE_CHECKING:
-    from .record import Motion, UpAxis
-
-Kind = Literal["npz", "npy", "pickle", "json", "bvh", "folder", "unknown"]
+Kind = Literal["npz", "npy", "pickle", "torch", "json", "bvh", "folder", "unknown"]
 BODY_ONLY = (
     "BODY ONLY: the file holds SMPL, which has no fingers, jaw, eyes or expression; they stay at "
     "rest. SMPL's joints are not quite SMPL-X's, so poses are off by a few degrees"
@@ -61,6 +58,7 @@ class Source:
 
 _TITLES = {
     "npz": "an .npz archive", "npy": "an .npy array", "pickle": "a pickle",
+    "torch": "a PyTorch file",
     "json": "a JSON document", "bvh": "a BVH file", "folder": "a folder",
     "unknown": "neither .npz, .npy, pickle, JSON nor BVH",
 }  # fmt: skip
@@ -77,7 +75,7 @@ class ReadOptions:
     fps: float | None = None
     up: UpAxis | None = None
     person: int | None = None
-    joint_map: str | Mapping[str, str] | None = None
+    joint_map: str | Path | Mapping[str, str] | None = None
     scale: float | None = None
     flat_hand_mean: bool | None = None
 
@@ -139,20 +137,16 @@ def open_source(path: str | Path) -> Source:
     with open(path, "rb") as file:
         head = file.read(512)
     if head[:4] == b"PK\x03\x04":
+        if is_torch(path):
+            return Source(path, "torch", load_torch(path))
         return Source(path, "npz", load_npz(path))
     if head[:6] == b"\x93NUMPY":
-        try:
-            return Source(path, "npy", np.load(path, allow_pickle=False))
-        except ValueError as error:
-            raise ValueError(f"{path}: not a readable .npy array ({error}).") from None
+        return Source(path, "npy", load_npy(path))
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     if start[:9].upper() == b"HIERARCHY":
         return Source(path, "bvh", path.read_text(encoding="utf-8-sig", errors="replace"))
     if start[:1] in (b"{", b"[") and path.suffix.lower() not in _PICKLES:
-        try:
-            return Source(path, "json", json.loads(path.read_text(encoding="utf-8-sig")))
-        except ValueError as error:
-            raise ValueError(f"{path}: not readable JSON ({error}).") from None
+        return Source(path, "json", load_json(path))
     if head[:1] == b"\x80" or path.suffix.lower() in _PICKLES:
         return Source(path, "pickle", load_pickle(path))
     return Source(path, "unknown")
@@ -167,3 +161,26 @@ def _listing(names: list[str], what: str) -> str:
         return f"no {what}"
     shown = ", ".join(names[:12])
     return f"{shown}, ... ({len(names)} {what})" if len(names) > 12 else shown
+
+
+def choose_person(counts: Mapping[int, int], person: int | None, where: str | Path) -> int:
+    """The requested person, or the only one.
+
+    Args:
+        counts: number of frames of each person.
+        person: the requested one, or None.
+        where: file, for messages.
+
+    Raises:
+        ValueError: there is no such person, or there are several and none was requested.
+    """
+    listed = ", ".join(f"{key} ({count} frames)" for key, count in sorted(counts.items()))
+    if not counts:
+        raise ValueError(f"{where}: there is no person in it.")
+    if person is not None:
+        if person not in counts:
+            raise ValueError(f"{where}: no person {person}; there are {listed}.")
+        return person
+    if len(counts) > 1:
+        raise ValueError(f"{where}: {len(counts)} people: {listed}. Choose one with person=.")
+    return next(iter(counts))

@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..body import SMPL_TREE
-from .format import BODY_ONLY, Format, ReadOptions, Source
-from .people import choose_person
+from .editing import fill_gaps, from_camera
+from .format import BODY_ONLY, Format, ReadOptions, Source, choose_person
 from .record import Motion
-from .resampling import fill_gaps
-from .rotate import from_camera
 from .values import check_finite, one_shape, rotation_vectors
 
 

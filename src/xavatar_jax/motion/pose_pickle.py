@@ -10,8 +10,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..files import atomic_folder, atomic_path
-from .convert import MotionNotice, shape_for
-from .record import Motion
+from .record import Motion, MotionNotice, shape_for
 from .values import grouped_poses
 
 # NumPy 2 names its functions by a new module, which the NumPy 1 of many Blenders has not; both

@@ -13,12 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from .format import Format, ReadOptions, Source
+from .editing import fill_gaps, from_camera
+from .format import Format, ReadOptions, Source, choose_person
 from .params import read_frames, to_motion
-from .people import choose_person
 from .record import Motion
-from .resampling import fill_gaps
-from .rotate import from_camera
 from .values import rotation_vectors
 
 _SMPL_JOINTS = 24

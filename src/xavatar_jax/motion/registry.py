@@ -20,10 +20,8 @@ from . import (
     xavatar,
     xhumans,
 )
-from .convert import MotionNotice
 from .format import Format, ReadOptions, Source, open_source
-from .record import Motion, UpAxis
-from .rotate import to_up
+from .record import Motion, MotionNotice, UpAxis
 
 FORMATS: dict[str, Format] = {
     module.FORMAT.name: module.FORMAT
@@ -45,7 +43,7 @@ def load_motion(
     up: UpAxis | None = None,
     person: int | None = None,
     flat_hand_mean: bool | None = None,
-    joint_map: str | Mapping[str, str] | None = None,
+    joint_map: str | Path | Mapping[str, str] | None = None,
     scale: float | None = None,
 ) -> Motion:
     """Read a motion from a file or folder, whose format is recognised by what is in it.
@@ -58,12 +56,13 @@ def load_motion(
         body: the body that is to move. Needed where a file's numbers mean nothing without one:
             hands relative to the mean hand or as principal components, EasyMocap, BVH.
         format: a key of `FORMATS`, for a file that could be several.
-        fps: frames a second, in the place of what the file says.
+        fps: frames per second, in the place of what the file says.
         up: the axis that points up in the file's world; None takes the format's own.
         person: which person, of a file with several.
         flat_hand_mean: True if the file's hands are absolute, False if they are relative to the
             mean hand; None takes what the file says, else the format's own.
-        joint_map: for BVH, a key of `JOINT_MAPS` or names of the file to names of SMPL-X.
+        joint_map: for BVH, a key of `JOINT_MAPS`, a mapping from names of the file to names of
+            SMPL-X, or the path of a JSON file with one.
         scale: for BVH, metres in one unit of the file.
 
     Raises:
@@ -115,7 +114,7 @@ def save_motion(
             "(X-Avatar), .pkl (one pose) or a folder, or pass format=."
         )
     if body is not None and name != "bvh":
-        motion = to_up(motion, body, "z" if name == "amass" else "y")
+        motion = motion.to_z_up(body) if name == "amass" else motion.to_y_up(body)
     if name == "amass":
         return amass.save_amass(path, motion)
     if body is None:

@@ -10,12 +10,10 @@ import re
 from pathlib import Path
 
 from ..files import load_npz
-from .format import Format, ReadOptions, Source
+from .editing import fill_gaps, from_camera
+from .format import Format, ReadOptions, Source, choose_person
 from .params import numbered, read_files, to_motion
-from .people import choose_person
 from .record import Motion
-from .resampling import fill_gaps
-from .rotate import from_camera
 
 _PATTERN = r"(\d+)(?:_(\d+))?\.npz"
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from ..body import SMPLX_TREE, pose_groups
-
-if TYPE_CHECKING:
-    from ..body import BodyModel
-    from .format import ReadOptions
-    from .record import Motion
+from ..body import SMPLX_TREE, BodyModel, pose_groups
+from ..files import load_npy
+from .format import ReadOptions
+from .record import Motion
 
 Side = Literal["left", "right"]
 # Rotation matrices in files are rounded to float32 or half, networks' are not quite orthogonal.
@@ -262,11 +260,10 @@ def listing(keys: Any) -> str:
 
 def read_mean_shape(file: Path) -> Float[np.ndarray, " S"]:
     """The shape in a `mean_shape_smplx.npy`: meshes are made with its first ten coefficients."""
-    try:
-        shape = np.load(file, allow_pickle=False).reshape(-1)
-    except ValueError as error:
-        raise ValueError(f"{file}: not a readable array of shape coefficients ({error}).") from None
-    return shape[:_NUM_BETAS].astype(np.float64)
+    shape = load_npy(file)
+    if not isinstance(shape, np.ndarray) or shape.dtype.kind not in "iuf":
+        raise ValueError(f"{file}: expected an array of shape coefficients.")
+    return shape.reshape(-1)[:_NUM_BETAS].astype(np.float64)
 
 
 def read_gender(file: Path) -> str:

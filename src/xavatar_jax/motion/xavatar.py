@@ -15,10 +15,9 @@ import numpy as np
 
 from ..body import BodyModel
 from ..files import atomic_path
-from .convert import MotionNotice, fit_size, shape_for
 from .format import Format, ReadOptions, Source
 from .params import read_frames, to_motion
-from .record import Motion
+from .record import Motion, MotionNotice, fit_size, shape_for
 from .values import grouped_poses
 
 _FIXED = 99

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .editing import fill_gaps
 from .format import Format, ReadOptions, Source
 from .params import numbered, read_files, to_motion
 from .record import Motion
-from .resampling import fill_gaps
 from .values import read_gender, read_mean_shape
 
 _PATTERN = r"mesh-f(\d+)_smplx\.pkl"

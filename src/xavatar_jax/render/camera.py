@@ -1,4 +1,4 @@
-"""Pinhole cameras, and cameras that frame a mesh by themselves."""
+"""Pinhole cameras, and cameras placed so that a mesh fills the picture."""
 
 import math
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class Camera:
         up: Vector = (0.0, 1.0, 0.0),
         fov: float = math.radians(25.0),
     ) -> "Camera":
-        """A camera at `position` (3,) that looks at `target` (3,), metres, with `up` upwards.
+        """A camera at `position` (3,) that looks at `target` (3,), metres, with `up` pointing up.
 
         Raises:
             ValueError: if position and target coincide, or `fov` is not within (0, pi).
@@ -55,7 +55,7 @@ class Camera:
         upward = upward / np.linalg.norm(upward)
         right = np.cross(forward, upward)
         if np.linalg.norm(right) < 1e-6:
-            # Looking along up: any right will do.
+            # Looking along up: any right is valid.
             right = np.cross(forward, np.roll(upward, 1))
         right /= np.linalg.norm(right)
         return cls(eye, np.stack([right, np.cross(forward, right), forward]), fov, upward)
@@ -68,9 +68,9 @@ class Camera:
         columns: slice = slice(None),
         supersample: int = 1,
     ) -> Float[np.ndarray, "H W 3"]:
-        """World direction through the centre of each pixel, depth 1 along the optical axis.
+        """World directions through the pixel centres, depth 1 along the optical axis, float32.
 
-        `rows` and `columns` choose a window, in blocks of `supersample` pixels; float32.
+        `rows` and `columns` select a window, in blocks of `supersample` pixels.
         """
         scale = 2.0 * math.tan(0.5 * self.fov) / height
         x = (np.arange(width) + 0.5 - 0.5 * width).reshape(-1, supersample)[columns].reshape(-1)
@@ -105,10 +105,10 @@ def frame_view(
     """A camera that shows all `points` (N, 3) of a person facing `forward`.
 
     Args:
-        points: what must be in the picture, metres.
+        points: what the picture must contain, metres.
         view: "front", "three_quarter" (the person's left), "left", "back" or "right".
         aspect: width of the picture over its height.
-        margin: free room, 1 for none.
+        margin: size of the picture over that of the points; 1 leaves no room.
         up: the world's up direction.
         forward: the direction that the person faces.
         elevation: how far above the horizon the camera stands, radians.
@@ -136,11 +136,11 @@ def part_view(
     forward: Vector = (0.0, 0.0, 1.0),
     fov: float = math.radians(22.0),
 ) -> Camera:
-    """A close-up of `points` (N, 3), seen from `direction` (3,), the way to the camera.
+    """A close-up of `points` (N, 3); `direction` (3,) points from them to the camera.
 
-    Without a direction, a flat part such as a hand is seen on its broad side, from the side that
-    faces `forward` or `up` more. Seen steeply from above or below, the picture's up is `forward`.
-    Other arguments are those of `frame_view`.
+    Without a direction, a flat part such as a hand is shown from its broad side that faces
+    `forward` and `up` more. From steeply above or below, `forward` is up in the picture. Other
+    arguments are those of `frame_view`.
 
     Raises:
         ValueError: if there are no points.
@@ -173,10 +173,10 @@ def orbit_views(
     elevation: float = math.radians(8.0),
     fov: float = math.radians(22.0),
 ) -> list[Camera]:
-    """`count` cameras on a circle about `points` (N, 3), the first in front, at one distance.
+    """`count` cameras on a circle around `points` (N, 3), at equal distance, the first in front.
 
-    All points are in all pictures, about the same middle. The camera goes to the person's left
-    first. Other arguments are those of `frame_view`.
+    Every picture contains all points. The camera moves to the person's left first. Other arguments
+    are those of `frame_view`.
 
     Raises:
         ValueError: if there are no points.
@@ -209,7 +209,7 @@ def _ground_axes(up: Vector, forward: Vector) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _distance(seen: Float[np.ndarray, "N 3"], slopes: Float[np.ndarray, "2"]) -> float:
-    """How far from the middle a camera has to be for all of what it sees to be in the picture."""
+    """The distance from the middle at which everything seen fits into the picture."""
     return float((np.abs(seen[:, :2]) / slopes - seen[:, 2:]).max())
 
 
@@ -221,7 +221,7 @@ def _fit(
     aspect: float,
     margin: float,
 ) -> Camera:
-    """The nearest camera along `direction` that has all points in its picture."""
+    """The nearest camera along `direction` whose picture contains all points."""
     if len(points) == 0:
         raise ValueError("no points to look at: there is nothing to frame.")
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -230,7 +230,7 @@ def _fit(
         camera = Camera.look_at(middle + direction, middle, up=up, fov=fov)
         seen = (points - middle) @ camera.rotation.T
         distance = _distance(seen, slopes)
-        # Centre what is seen rather than the box: perspective shifts it.
+        # Centre the projected points, not the box: perspective shifts them.
         plane = seen[:, :2] / np.maximum(seen[:, 2:] + distance, 1e-9)
         shift = 0.5 * (plane.min(axis=0) + plane.max(axis=0)) * distance
         middle = middle + shift @ camera.rotation[:2]

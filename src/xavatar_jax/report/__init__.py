@@ -1,7 +1,7 @@
-"""What a run leaves behind: metrics, pictures, an animation, meshes."""
+"""Metrics, charts and pictures of a run."""
 
 from .charts import line_chart as line_chart
-from .curves import loss_curves as loss_curves
+from .charts import loss_curves as loss_curves
 from .machine import available_cores as available_cores
 from .machine import describe_machine as describe_machine
 from .machine import gpu_advice as gpu_advice

@@ -1,11 +1,14 @@
-"""Lines over numbers, as a picture."""
+"""Line charts as pictures, and the losses of a run."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import UInt8
+
+from ..learning import History
 
 _PER_INCH = 100
 
@@ -19,12 +22,12 @@ def line_chart(
     log_x: bool = True,
     size: tuple[int, int] = (560, 420),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Named lines of (x, y), y on a logarithmic axis; the names stand below.
+    """Named lines of (x, y) with a logarithmic y axis and the legend below.
 
-    - `x_ticks`: where the x axis has its numbers, if not where they are round.
-    - `size`: width and height, pixels.
+    - `x_ticks`: positions of the labels on the x axis. Default: round numbers.
+    - `size`: width and height in pixels.
     """
-    # Not pyplot: it looks for a display, and keeps what it has drawn.
+    # Not pyplot, which looks for a display and keeps its figures.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -54,3 +57,30 @@ def line_chart(
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def loss_curves(
+    history: History, *, size: tuple[int, int] = (760, 460)
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Loss terms and validation loss against the training step, on a logarithmic scale.
+
+    Values that are zero or not finite are left out. `size` is width and height in pixels.
+
+    **Raises:** `ValueError` if no value can be drawn.
+    """
+    steps = history.steps
+    terms = {n: values for n, values in history.terms.items() if not n.endswith("gradient")}
+    curves = {name: _drawable(steps, values) for name, values in terms.items() if name != "found"}
+    curves["validation"] = _drawable(history.validated, history.validation)
+    curves = {name: curve for name, curve in curves.items() if curve}
+    if not curves:
+        raise ValueError("no losses were recorded: there is nothing to draw")
+    return line_chart(curves, x_label="step", log_x=False, size=size)
+
+
+def _drawable(steps: Sequence[int], values: Sequence[float]) -> list[tuple[float, float]]:
+    return [
+        (step, value)
+        for step, value in zip(steps, values, strict=True)
+        if math.isfinite(value) and value > 0
+    ]

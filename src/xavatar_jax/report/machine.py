@@ -1,4 +1,4 @@
-"""Versions, device and memory, for the head of every result."""
+"""Versions, device and memory, recorded with every result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def peak_rss_mb() -> float | None:
-    """Largest resident memory of this process so far, MiB; None where it cannot be read."""
+    """Peak resident memory of this process, MiB; None where it is not available."""
     try:
         import resource
     except ImportError:
@@ -41,30 +41,30 @@ def peak_rss_mb() -> float | None:
 
 
 def available_cores() -> int:
-    """Cores that this process may use: fewer than the machine has where it is pinned."""
+    """Number of cores that this process may use, which may be fewer than the machine has."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def gpu_advice(platforms: set[str]) -> str | None:
-    """What to do if there is an NVIDIA GPU that JAX does not see; None if all is well.
+    """Advice if there is an NVIDIA GPU that JAX does not use, else None.
 
     `platforms`: those of JAX's devices ("cpu", "gpu", ...).
     """
     if platforms - {"cpu"} or not nvidia_gpu_present():
         return None
-    found = "an NVIDIA GPU is here, but JAX runs on the CPU: "
+    found = "there is an NVIDIA GPU, but JAX runs on the CPU: "
     if any(_version(plugin) for plugin in _CUDA_PLUGINS):
         return found + (
-            "its support is installed, but does not start; look at nvidia-smi, and at "
-            "JAX_PLATFORMS and CUDA_VISIBLE_DEVICES in the environment"
+            "GPU support is installed but does not start; check nvidia-smi and the environment "
+            "variables JAX_PLATFORMS and CUDA_VISIBLE_DEVICES"
         )
-    return found + 'install its support with pip install "xavatar-jax[gpu]"'
+    return found + 'install GPU support: pip install -e ".[gpu]"'
 
 
 def nvidia_gpu_present() -> bool:
-    """Whether the system shows an NVIDIA GPU: its device, its driver, or the driver's tool."""
+    """Whether there is an NVIDIA GPU: a device, a driver or nvidia-smi."""
     here = any(Path(place).exists() for place in ("/dev/nvidia0", "/proc/driver/nvidia"))
     return here or shutil.which("nvidia-smi") is not None
 
@@ -81,9 +81,9 @@ def _version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of the source tree, or None outside of one."""
+    """Commit of the source tree, or None outside a checkout."""
     here = Path(__file__).resolve().parents[3]
-    if not (here / ".git").exists():  # installed: a repository around it is another's
+    if not (here / ".git").exists():  # installed; a surrounding repository is unrelated
         return None
     try:
         done = subprocess.run(

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from ..avatar import Avatar, Evaluation
+from ..avatar import Avatar, BodyOnlyAvatar, Evaluation
 from ..files import atomic_path
 from ..metrics import REGIONS
 from .machine import describe_machine
@@ -25,18 +25,18 @@ _ROWS = (
 def metrics_record(
     evaluation: Evaluation,
     before: Evaluation | None,
-    avatar: Avatar,
+    avatar: Avatar | BodyOnlyAvatar,
     seconds: Mapping[str, float],
     **more: Any,
 ) -> dict[str, Any]:
-    """Everything that `metrics.json` holds."""
+    """The contents of `metrics.json`; `more` is added as it is."""
     machine = describe_machine()
     return {
         **evaluation.to_json(),
         "before": None if before is None else before.mean.to_json(),
         "seconds": {name: round(value, 2) for name, value in seconds.items()},
-        "preset": avatar.config.preset,
-        "seed": avatar.config.seed,
+        "preset": avatar.options.get("preset"),
+        "seed": avatar.options.get("seed"),
         "steps": avatar.steps,
         "body": avatar.body.source.describe(),
         **machine,
@@ -45,9 +45,9 @@ def metrics_record(
 
 
 def metrics_table(evaluation: Evaluation, before: Evaluation | None = None) -> str:
-    """The mean figures, one row each, for all, hands and face; before training in brackets.
+    """A table of mean metrics for all, hands and face, with those before training in brackets.
 
-    Where training poses were given, the Chamfer distance of each third of the frames follows.
+    If training poses are known, the Chamfer distance of each third of the frames follows.
     """
     head = f"{'held-out, ' + str(len(evaluation.per_frame)) + ' frames':24}"
     lines = [head + "".join(f"{region:>20}" for region in REGIONS)]
@@ -60,7 +60,7 @@ def metrics_table(evaluation: Evaluation, before: Evaluation | None = None) -> s
             row += f"{cell:>20}"
         lines.append(row)
     if before is not None:
-        lines.append("in brackets: before training, the body's mean shape")
+        lines.append("in brackets: before training (the body's mean shape)")
     groups = evaluation.by_pose_distance()
     if groups:
         lines.append("Chamfer (mm), by distance to the nearest training pose")
@@ -72,7 +72,7 @@ def metrics_table(evaluation: Evaluation, before: Evaluation | None = None) -> s
 
 
 def write_json(path: str | os.PathLike[str], record: Mapping[str, Any]) -> None:
-    """Write plain values as JSON, under a temporary name first. NaN is an error, never written."""
+    """Write plain values as JSON, whole or not at all. **Raises:** `ValueError` for NaN."""
     text = json.dumps(record, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")

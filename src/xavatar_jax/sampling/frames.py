@@ -1,4 +1,4 @@
-"""Which frames to learn from, and how far others are from them."""
+"""Selection of varied training frames, and distances between poses."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from ..kinematics import axis_angle_to_matrix
 
 
 def varied_frames(params: BodyParams, count: int) -> Int[np.ndarray, " n"]:
-    """Indices of `count` frames that differ most in pose and expression, in rising order.
+    """Sorted indices of `count` distinct frames that differ most in pose and expression.
 
-    Greedy farthest-point choice from the first frame, over the rotations of all joints but the
-    root (fingers count half, since there are many) and the expression. Deterministic; no frame is
-    chosen twice, however alike they are.
+    Greedy farthest-point selection from the first frame, over the expression and the rotations of
+    all joints except the root; the many finger joints have half the weight. Deterministic.
     """
     from scipy.spatial.distance import cdist
 
@@ -34,19 +33,18 @@ def varied_frames(params: BodyParams, count: int) -> Int[np.ndarray, " n"]:
         chosen.append(newest)
         if len(chosen) == count:
             return np.sort(np.asarray(chosen))
-        # cdist makes no array of the size of the features, which are large for long captures.
+        # cdist allocates no array of the size of the features, which are large for long captures.
         gap = np.minimum(gap, cdist(features, features[newest : newest + 1], "sqeuclidean")[:, 0])
-        gap[newest] = -np.inf  # among frames all alike, the farthest is still another one
+        gap[newest] = -np.inf  # not chosen again, even if all frames are equal
         newest = int(gap.argmax())
 
 
 def pose_distance(params: BodyParams, known: BodyParams) -> Float[np.ndarray, " n"]:
-    """How far each frame's pose is from the nearest of the known frames', degrees.
+    """Distance of each frame's pose to the nearest known pose, degrees.
 
-    The distance of two poses is the root mean square of the angles between their joints'
-    rotations; the root, which turns the whole person, has no part in it.
+    This is the root mean square angle between joint rotations, without the root.
 
-    **Raises:** `ValueError` if the two are for trees with different numbers of joints.
+    **Raises:** `ValueError` if the numbers of joints differ.
     """
     if params.tree.num_joints != known.tree.num_joints:
         raise ValueError(

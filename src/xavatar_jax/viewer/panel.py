@@ -9,8 +9,7 @@ import numpy as np
 
 from ..kinematics import KinematicTree
 from ..render import color_bar
-from .poses import joint_choices
-from .surfaces import AVATAR, ERROR, WEIGHTS, Wish
+from .surfaces import AVATAR, ERROR, WEIGHTS, Request, joint_choices
 
 _ALL = "all bones"
 _AXES = ("x", "y", "z")
@@ -18,16 +17,16 @@ _LARGEST_TURN, _LARGEST_EXPRESSION = 120.0, 3.0
 
 
 class Panel:
-    """Handles of the panel, and what they say.
+    """The panel's handles and what they ask for.
 
     Args:
-        server: of viser.
+        server: a viser server.
         tree: joints of the body.
-        num_frames: of the motion.
-        num_expression: coefficients.
-        shadings: what can be shown.
-        max_error_mm: red in the bar of error colours.
-        changed: called without arguments when anything was moved.
+        num_frames: length of the motion.
+        num_expression: number of expression coefficients.
+        shadings: available shadings.
+        max_error_mm: red end of the error colours.
+        changed: called without arguments after every change.
     """
 
     def __init__(
@@ -58,15 +57,15 @@ class Panel:
         self._reset = self._gui.add_button("Reset pose and expression")
         self._reset.on_click(lambda _: self.reset())
 
-    def wish(self) -> Wish:
-        """What is asked for now."""
+    def request(self) -> Request:
+        """What the panel asks for now."""
         bone = None if self.bone.value == _ALL else self._tree.index(self.bone.value)
         turns = tuple(
             (joint, (t[0], t[1], t[2]))
             for joint, t in sorted(dict(self._turns).items())
             if any(abs(v) > 1e-9 for v in t)
         )
-        return Wish(
+        return Request(
             frame=int(self.frame.value),
             shading=self.shading.value,
             bone=bone if self.shading.value == WEIGHTS else None,
@@ -76,12 +75,12 @@ class Panel:
         )
 
     def say(self, text: str) -> None:
-        """Put a line at the top of the panel."""
+        """Show a line at the top of the panel."""
         if self._status.content != text:
             self._status.content = text
 
     def reset(self) -> None:
-        """All joints and coefficients of the sliders back to zero."""
+        """Set all joint and expression sliders to zero."""
         self._turns.clear()
         for slider in self._expression:
             slider.value = 0.0
@@ -90,7 +89,7 @@ class Panel:
         self._changed()
 
     def set_turn(self, joint: int, degrees: tuple[float, float, float]) -> None:
-        """Turn one joint, as its sliders do."""
+        """Turn one joint as its sliders do."""
         self._turns[joint] = [float(np.deg2rad(v)) for v in degrees]
         for show in self._groups:
             show()
@@ -99,13 +98,13 @@ class Panel:
     def _add_player(self, num_frames: int) -> None:
         moving = num_frames > 1
         with self._gui.add_folder("Motion", visible=moving):
-            self.playing = self._gui.add_checkbox("Play", False, hint="Play the motion in a loop")
+            self.playing = self._gui.add_checkbox("Play", False, hint="Play the motion repeatedly")
             self.frame = self._gui.add_slider("Frame", 0, max(num_frames - 1, 1), 1, 0)
             self.speed = self._gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
             self.in_place = self._gui.add_checkbox("Stay in place", False)
 
         def sought(event: Any) -> None:
-            # Moved by hand, not by the player.
+            # Moved by the user, not by the player.
             if event.client_id is not None:
                 self.seeks += 1
             self._changed()
@@ -130,7 +129,7 @@ class Panel:
         self.bone.on_update(lambda _: self._changed())
 
     def _add_joints(self, name: str, choices: dict[str, tuple[int, ...]]) -> Callable[[], None]:
-        """Sliders of one group; gives the function that shows the stored turns on them."""
+        """Add the sliders of one group; returns a function that sets them to the stored turns."""
         with self._gui.add_folder(name, expand_by_default=False):
             names = tuple(choices)
             first = "left shoulder" if "left shoulder" in choices else names[0]
@@ -146,7 +145,7 @@ class Panel:
                 slider.value = float(np.clip(np.round(value), -_LARGEST_TURN, _LARGEST_TURN))
 
         def turn(event: Any) -> None:
-            if event.client_id is None:  # set by `show`, not by hand
+            if event.client_id is None:  # set by `show`, not by the user
                 return
             values = [float(np.deg2rad(slider.value)) for slider in sliders]
             for each in choices[joint.value]:

@@ -1,4 +1,4 @@
-"""`view`: an avatar in the browser, posed by sliders or played."""
+"""`view`: show an avatar in the browser, posed by sliders or playing a motion."""
 
 from __future__ import annotations
 
@@ -12,40 +12,38 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..avatar import Avatar
-from ..avatar.animate import DEFAULT_FPS, MotionLike
+from ..avatar import DEFAULT_FPS, Drivable, MotionLike, animate
 from ..body import BodyParams, canonical_params, facing, root_rotation
 from ..frames import Frames
 from ..render import frame_view
 from .panel import Panel
-from .poses import UP, UpAxis, frame_of, rest_params
-from .stage import Stage
-from .surfaces import Surfaces, Wish
+from .scene import Scene
+from .surfaces import UP, Request, Surfaces, UpAxis, frame_of, rest_params
 
-# The player sends no more pictures a second than this.
+# Frames per second that the player sends at most.
 _FASTEST = 30.0
 
 
 class Viewer:
-    """A viewer that runs until it is stopped; made by `view`. Notebooks show it in place.
+    """A running viewer, made by `view`. Notebooks display it inline.
 
-    - `url`: where it is.
+    - `url`: address of the page.
     - `panel`: handles of its sliders, for scripts: `viewer.panel.frame.value = 10`.
-    - `shown`: what the panel asked for when the surface now shown was made.
+    - `shown`: the request for which the current surface was made.
     """
 
     def __init__(
         self,
         server: Any,
-        stage: Stage,
+        scene: Scene,
         panel: Panel,
         surfaces: Surfaces,
         fps: float,
         changed: threading.Event,
     ):
-        self._server, self._stage, self._surfaces, self._fps = server, stage, surfaces, fps
+        self._server, self._scene, self._surfaces, self._fps = server, scene, surfaces, fps
         self.panel = panel
-        self.shown: Wish | None = None
+        self.shown: Request | None = None
         self.url = f"http://{_reachable(server.get_host())}:{server.get_port()}"
         self._changed = changed
         self._shown = threading.Event()
@@ -54,10 +52,10 @@ class Viewer:
         self._worker = threading.Thread(target=self._work, name="viewer", daemon=True)
         self._worker.start()
 
-    def wait_until_shown(self, timeout: float | None = None) -> None:
-        """Return when the avatar's own surface is shown, which is extracted on first use.
+    def wait_until_shown(self, timeout: float | int | None = None) -> None:
+        """Wait until the avatar's surface, which is extracted on first use, is shown.
 
-        **Raises:** `TimeoutError`; what the extraction raised.
+        **Raises:** `TimeoutError`, and any error of the extraction.
         """
         if not self._shown.wait(timeout):
             raise TimeoutError(f"no surface after {timeout} s")
@@ -65,12 +63,12 @@ class Viewer:
             raise self._error
 
     def wait(self) -> None:
-        """Go on until Ctrl-C, then stop. **Raises:** what ended the viewer, if anything did."""
+        """Run until Ctrl-C, then stop. **Raises:** the error that ended the viewer, if any."""
         try:
             while not self._stopped.wait(0.5):
                 pass
         except KeyboardInterrupt as stop:
-            if type(stop) is not KeyboardInterrupt:  # a signal that a program has made one of
+            if type(stop) is not KeyboardInterrupt:  # a signal converted to an exception
                 raise
         finally:
             self.stop()
@@ -111,10 +109,10 @@ class Viewer:
             print(f"the viewer stopped: {error}", file=sys.stderr)
 
     def _run(self) -> None:
-        self.panel.say("The avatar's surface is being extracted; until then the body is shown.")
-        self._stage.show(self._surfaces.template(0))
-        self._stage.place_ground(self._surfaces.ground_height())
-        self._surfaces.avatar.neutral_surface  # noqa: B018  # the surface and what is kept of it
+        self.panel.say("Extracting the avatar's surface; showing the body until then.")
+        self._scene.show(self._surfaces.template(0))
+        self._scene.place_ground(self._surfaces.ground_height())
+        self._surfaces.avatar.rest  # noqa: B018  # extracted on first use
         self.panel.say("")
         clock = _Clock(self.panel, self._fps)
         while not self._stopped.is_set():
@@ -124,25 +122,25 @@ class Viewer:
             else:
                 clock.pause()
             self._changed.clear()
-            wish = self.panel.wish()
-            if wish != self.shown:
-                self._show(wish)
+            request = self.panel.request()
+            if request != self.shown:
+                self._show(request)
             if self.panel.playing.value:
                 pause = 1.0 / _FASTEST - (time.perf_counter() - started)
                 self._stopped.wait(max(pause, 0.001))
             else:
                 self._changed.wait()
 
-    def _show(self, wish: Wish) -> None:
+    def _show(self, request: Request) -> None:
         try:
-            surface = self._surfaces(wish)
-        except Exception as error:  # one frame that cannot be read does not end the viewer
-            self.panel.say(f"**Frame {wish.frame} cannot be shown:** {error}")
-            print(f"frame {wish.frame} cannot be shown: {error}", file=sys.stderr)
+            surface = self._surfaces(request)
+        except Exception as error:  # a frame that cannot be read must not end the viewer
+            self.panel.say(f"**Frame {request.frame} cannot be shown:** {error}")
+            print(f"frame {request.frame} cannot be shown: {error}", file=sys.stderr)
         else:
-            self._stage.show(surface)
+            self._scene.show(surface)
             self.panel.say(surface.note)
-        self.shown = wish
+        self.shown = request
         self._shown.set()
 
 
@@ -170,7 +168,7 @@ class _Clock:
 
 
 def view(
-    avatar: Avatar,
+    avatar: Drivable,
     motion: MotionLike | BodyParams | None = None,
     frames: Frames | None = None,
     *,
@@ -181,34 +179,33 @@ def view(
     max_error_mm: float = 2.0,
     verbose: bool = True,
 ) -> Viewer:
-    """Show an avatar in the browser: pose it by sliders, play a motion, look at its weights.
+    """Show an avatar in the browser: pose it with sliders, play a motion, inspect its weights.
 
-    The call returns at once; the page first shows the body, and the avatar as soon as its
-    surface is extracted. In a script, `view(...).wait()` keeps it until Ctrl-C; a notebook shows
-    the result in place. From another machine: `ssh -L 8080:localhost:8080 HOST`, then open the
-    address here.
+    Returns at once; the page shows the body until the avatar's surface is extracted. In a script,
+    `view(...).wait()` keeps it open until Ctrl-C; notebooks display the result inline. If it runs
+    on another machine, `ssh -L 8080:localhost:8080 HOST` and open the address locally.
 
     Args:
-        avatar: what is shown.
-        motion: a motion, or parameters `(T, ...)` at 30 frames a second. Default: that of
+        avatar: the avatar to show.
+        motion: a motion, or parameters `(T, ...)` at 30 frames per second. Default: the motion of
             `frames`, else the rest pose.
         frames: ground truth, one mesh for each frame of the motion.
-        port: of the page; the next free one if it is taken.
-        host: "localhost" answers this machine alone, "0.0.0.0" every machine of the network.
-        open: open the page in the browser of this machine.
-        up: the world axis that points up, in place of the motion's own (y for parameters).
-        max_error_mm: the distance that is red when the error is shown.
+        port: of the page; if it is taken, the next free one is used.
+        host: "localhost" serves this machine only, "0.0.0.0" the whole network.
+        open: open the page in the local browser.
+        up: the world axis that points up. Default: that of the motion; y for parameters.
+        max_error_mm: the distance shown in red.
         verbose: print the address.
 
     Raises:
         ImportError: if viser is missing.
-        ValueError: for parameters that do not fit the body, another number of frames than the
-            motion has, or as for `Avatar.animate`.
-        TypeError: if `motion` is no motion.
+        ValueError: if the parameters do not fit the body, the numbers of frames differ, or as for
+            `Avatar.animate`.
+        TypeError: if `motion` is not a motion.
     """
     viser = _viser()
     driven = motion if motion is not None else None if frames is None else frames.params
-    animation = avatar.animate(rest_params(avatar) if driven is None else driven)
+    animation = animate(avatar, rest_params(avatar) if driven is None else driven)
     if frames is not None and len(frames) != len(animation):
         raise ValueError(
             f"{len(frames)} frames of ground truth for a motion of {len(animation)} frames: give "
@@ -219,7 +216,7 @@ def view(
         raise ValueError(f"up axis {axis!r}; it must be 'y' or 'z'")
     params = jax.tree.map(np.asarray, animation.params)
     surfaces = Surfaces(avatar, params, frames, np.asarray(UP[axis]), max_error_mm)
-    with contextlib.redirect_stdout(io.StringIO()):  # its own table of addresses
+    with contextlib.redirect_stdout(io.StringIO()):  # hides its table of addresses
         server = viser.ViserServer(host=host, port=port, label="xavatar_jax", verbose=False)
     try:
         viewer = _start(
@@ -238,9 +235,9 @@ def view(
 
 
 def _start(server: Any, surfaces: Surfaces, axis: UpAxis, fps: float) -> Viewer:
-    """Scene and panel of a server, and the thread that keeps them in step."""
+    """Create scene and panel, and start the thread that connects them."""
     body, first = surfaces.avatar.body, frame_of(surfaces.params, 0)
-    # The rest pose, turned and moved: it is known at once, and near enough for the first view.
+    # The rest pose with the frame's root: available at once, and close enough for the first view.
     outline = np.asarray(body.template) @ root_rotation(first).T + np.asarray(first.transl)
     camera = frame_view(
         outline[:: max(len(outline) // 2000, 1)],
@@ -250,7 +247,7 @@ def _start(server: Any, surfaces: Surfaces, axis: UpAxis, fps: float) -> Viewer:
         margin=1.05,
     )
     middle = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
-    stage = Stage(server, camera, middle, axis)
+    scene = Scene(server, camera, middle, axis)
     changed = threading.Event()
     panel = Panel(
         server,
@@ -261,7 +258,7 @@ def _start(server: Any, surfaces: Surfaces, axis: UpAxis, fps: float) -> Viewer:
         max_error_mm=surfaces.max_error_mm,
         changed=changed.set,
     )
-    return Viewer(server, stage, panel, surfaces, fps, changed)
+    return Viewer(server, scene, panel, surfaces, fps, changed)
 
 
 def _reachable(host: str) -> str:
@@ -273,7 +270,7 @@ def _viser() -> Any:
         import viser
     except ImportError as error:
         raise ImportError(
-            "the viewer needs viser, which the extra `view` brings: pip install "
-            "'xavatar-jax[view]'. `xa.view_html` needs nothing and writes a page that plays alone."
+            'the viewer needs viser: in a clone of the project, pip install -e ".[view]". '
+            "`xa.view_html` needs no extra package and writes a page that plays offline."
         ) from error
     return viser

@@ -1,0 +1,37 @@
+"""Training of any model on any data: stages, upkeep, validation, budgets, checkpoints, logs."""
+
+from .budget import Pace as Pace
+from .budget import check_minutes as check_minutes
+from .checkpoint import Checkpoint as Checkpoint
+from .checkpoint import Identity as Identity
+from .checkpoint import Keeper as Keeper
+from .checkpoint import as_arrays as as_arrays
+from .checkpoint import load_checkpoint as load_checkpoint
+from .devices import BY_FRAME as BY_FRAME
+from .devices import BY_POINT as BY_POINT
+from .devices import ONE_DEVICE as ONE_DEVICE
+from .devices import Devices as Devices
+from .devices import share_work as share_work
+from .loop import Callback as Callback
+from .loop import Schedule as Schedule
+from .loop import Trained as Trained
+from .loop import Upkeep as Upkeep
+from .loop import train as train
+from .record import History as History
+from .record import JsonLines as JsonLines
+from .record import progress as progress
+from .record import read_log as read_log
+from .stage import CONSTANT as CONSTANT
+from .stage import FALLING as FALLING
+from .stage import STEPWISE as STEPWISE
+from .stage import Decay as Decay
+from .stage import Stage as Stage
+from .stage import Term as Term
+from .stage import Terms as Terms
+from .stage import autodiff as autodiff
+from .stopping import Interrupted as Interrupted
+from .stopping import TrainingError as TrainingError
+from .stopping import TrainingNotice as TrainingNotice
+from .stopping import notify as notify
+from .validation import Best as Best
+from .validation import Validation as Validation
