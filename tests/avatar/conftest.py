@@ -10,7 +10,6 @@ import pytest
 import xavatar_jax as xa
 from xavatar_jax.fields import GridSpacing
 from xavatar_jax.frames import frames_from_params
-from xavatar_jax.methods import Fit
 from xavatar_jax.methods.xavatar import start
 
 
@@ -22,7 +21,7 @@ class SmallRun:
     train: xa.Frames
     test: xa.Frames
     config: xa.FitConfig
-    fit: Fit
+    fit: xa.Fit
 
 
 def small_config() -> xa.FitConfig:
@@ -58,7 +57,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> SmallRun:
     body = xa.synthetic_body()
     train, test = random_frames(body, 8, 0), random_frames(body, 3, 1)
     config = small_config()
-    cache = tmp_path_factory.mktemp("prefit")
+    cache = tmp_path_factory.mktemp("mean_shape")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(start, "_POINTS", 60_000)  # a rough start is enough
         fit = xa.fit(train, config, body=body, cache=cache, verbose=False)

@@ -77,7 +77,7 @@ def test_history_has_every_term(run):
     assert history.steps_done == run.config.steps
     assert {"loss", "occupancy", "bone", "skinning_surface", "skinning_joint"} <= set(history.terms)
     assert history.terms["occupancy"][-1] < history.terms["occupancy"][0]
-    assert {"prefit", "settle", "labels", "roots", "compile", "train", "total"} <= set(
+    assert {"prefit", "weights", "labels", "roots", "compile", "train", "total"} <= set(
         history.seconds
     )
 

@@ -11,12 +11,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from xavatar_jax.training import Interrupted, loop
 
 import xavatar_jax as xa
-from xavatar_jax import report
+from xavatar_jax import methods, report
 from xavatar_jax.avatar import Evaluation
 from xavatar_jax.cli import fit as command
+from xavatar_jax.learning import Interrupted
 from xavatar_jax.metrics import MeshMetrics, RegionValues
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "fit_grab.py"
@@ -38,11 +38,12 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
     test = read_by(run.test, events)
     capture = SimpleNamespace(body=run.body, name="case", train=run.train, test=test, notices=())
     short = replace(run.config, steps=4, report_every=2)
-    fit, evaluate = xa.fit, xa.evaluate
+    evaluate = xa.evaluate
 
     def noted_fit(frames, config, **options):
         events.append("fit begins")
-        done = fit(frames, config, **options)
+        # From the model of all these tests, for whose grids there are programs.
+        done = xa.fit(frames, config, model=run.fit.avatar.model, **options)
         events.append("fit ends")
         return done
 
@@ -50,10 +51,8 @@ def test_held_out_frames_are_read_after_training_alone(run, tmp_path, monkeypatc
         # Of the avatar of all these tests, whose surface is there already.
         return evaluate(run.fit.avatar, frames, **{**options, "num_frames": 1})
 
-    monkeypatch.setattr(loop, "initial_fields", lambda *_, **__: run.fit.before.model)
-    # With the grid of the person, whose programs are compiled.
-    monkeypatch.setattr(loop, "settle_on_person", lambda *_, **__: run.fit.avatar.model)
-    monkeypatch.setattr(xa, "fit", noted_fit)
+    method = methods.Method(noted_fit, methods.PRESETS)
+    monkeypatch.setattr(methods, "METHODS", {"xavatar": method})
     monkeypatch.setattr(xa, "evaluate", quick_evaluate)
     monkeypatch.setattr(command, "load", lambda options: capture)
     monkeypatch.setattr(command, "configure", lambda options: short)
@@ -108,7 +107,8 @@ def test_the_example_says_how_to_go_on(run, tmp_path, monkeypatch, capsys, numbe
     capture = SimpleNamespace(body=run.body, name="case", train=run.train, test=run.test)
     monkeypatch.setattr(xa, "synthetic_body", lambda *_: run.body)
     monkeypatch.setattr(xa, "synthetic_capture", lambda *_, **__: capture)
-    monkeypatch.setattr(xa, "fit", stopped)
+    method = methods.Method(stopped, methods.PRESETS)
+    monkeypatch.setattr(methods, "METHODS", {"xavatar": method})
     monkeypatch.setattr(sys, "argv", ["fit_grab.py", "--out", str(tmp_path), "--quiet"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(EXAMPLE), run_name="__main__")

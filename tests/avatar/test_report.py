@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from xavatar_jax.training import History
 
 import xavatar_jax as xa
+from xavatar_jax.learning import History
 from xavatar_jax.report import (
     loss_curves,
     metrics_record,

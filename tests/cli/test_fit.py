@@ -55,7 +55,7 @@ def test_every_other_entry_is_an_option():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--config.steps", "3"], "an option of its own, --steps"),
+        (["--config.steps", "3"], "use the option --steps"),
         (["--config.train-frames=3"], "use the option --train-frames"),
         (["--config.losses.surfac", "3"], "Unrecognized"),
         (["--config.losses.surface", "much"], "surface"),
@@ -167,7 +167,9 @@ def test_a_field_without_a_surface_ends_it_with_advice(call, tmp_path, monkeypat
 def test_evaluate_prints_and_writes_the_same_figures(call, avatar_file, tmp_path):
     out = tmp_path / "figures" / "metrics.json"
     code, said, error = call("evaluate", avatar_file, "--eval-frames", 1, "--out", out)
-    assert (code, error) == (0, "")
+    assert code == 0
+    # On a slow machine, lines of progress.
+    assert all(line.startswith("evaluation: ") for line in error.splitlines())
     record = json.loads(out.read_text())
     assert record["frames"] == 1
     assert record["preset"] == "paper"

@@ -18,7 +18,8 @@ import json
 from dataclasses import replace
 import equinox as eqx, jax, jax.numpy as jnp, numpy as np
 from toy_problem import HeldError, Line, Turn, line, points, stage
-from xavatar_jax.learning import BY_FRAME, BY_POINT, Devices, Schedule, Validation, share_work, train
+from xavatar_jax.learning import BY_FRAME, BY_POINT, Devices, Schedule, Validation
+from xavatar_jax.learning import share_work, train
 
 class Batch(eqx.Module):
     x: jax.Array

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
+import xavatar_jax as xa
 from xavatar_jax.avatar import body_only_params
 from xavatar_jax.fields import GridSpacing
 from xavatar_jax.frames import frames_from_params
@@ -91,12 +92,12 @@ def test_scanimate_learns(start, frames, cache):
         start=start,
         skin=replace(config.skin, steps=0),
         cycle=replace(config.cycle, steps=30, frames=2, points=32),
-        shape=replace(config.shape, steps=60, frames=2, points=200),
+        shape=replace(config.shape, steps=300, frames=2, points=200),
     )
     found = fit_scanimate(frames, config, cache=cache, verbose=False)
     terms, history = found.history.terms, found.history
     check_fell(terms["shape_surface"])
-    assert history.steps_done == 90
+    assert history.steps_done == 330
     assert history.stopped == "steps"
     assert {"prefit", "data", "train", "canonical", "total"} <= set(history.seconds)
     avatar = found.avatar.avatar

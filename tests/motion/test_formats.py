@@ -11,8 +11,8 @@ import pytest
 import writers
 from helpers import COLUMNS, PARENTS, reference_body, toy_arrays
 from scipy.spatial.transform import Rotation
-from xavatar_jax.baselines import body_only
 
+from xavatar_jax.avatar import body_only
 from xavatar_jax.body import SMPLX_TREE, BodyParams, hands_to_relative
 from xavatar_jax.files import UnsafePickleError
 from xavatar_jax.motion import FORMATS, Motion, MotionNotice, load_motion, save_motion

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
-from xavatar_jax.training import prefit
 
 import xavatar_jax as xa
 from xavatar_jax.avatar import CellSizes
-from xavatar_jax.fields import GridSpacing
+from xavatar_jax.fields import GridSpacing, build_model
+from xavatar_jax.methods.xavatar import start
 
 
 @pytest.fixture(scope="session")
 def avatar(bundled_body, tmp_path_factory) -> xa.Avatar:
     config = xa.quick()
     coarse = GridSpacing(body=0.03, hands=0.0075, face=0.01, band=0.06)
-    config = replace(config, prefit_steps=60, skinning=replace(config.skinning, grid=coarse))
-    cache = tmp_path_factory.mktemp("prefit")
+    spec = replace(config, skinning=replace(config.skinning, grid=coarse)).spec
+    model = build_model(spec, bundled_body, key=jax.random.key(0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prefit, "_POINTS", 60_000)  # a rough person is enough
-        fields = prefit.initial_fields(bundled_body, config, cache=cache, verbose=False)
-    made = xa.Avatar(bundled_body, np.zeros(10, np.float32), fields, config)
+        patch.setattr(start, "_POINTS", 60_000)  # a rough person is enough
+        model = start.fit_mean_shape(
+            model, spec, bundled_body, steps=60, optimiser=config.optimiser, seed=0,
+            cache=tmp_path_factory.mktemp("mean_shape"), verbose=False,
+        )  # fmt: skip
+    made = xa.Avatar(bundled_body, np.zeros(10, np.float32), model, spec)
     # What is shown of the surface is the same whatever its cells, and these take a second.
     made.__dict__["_base_mesh"] = made.canonical_mesh(cell=CellSizes().scaled(2.5))
     return made

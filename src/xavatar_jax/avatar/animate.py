@@ -31,7 +31,7 @@ _FRAME_BLOCK = 64
 class MotionLike(Protocol):
     """The part of `xa.Motion` that animations use.
 
-    `fps`; the `up` axis; the `source`, for messages; and `to_params(body)`, the parameters.
+    `fps`; the `up` axis; the `source`, for messages; and `to_params`, the parameters for a body.
     """
 
     @property

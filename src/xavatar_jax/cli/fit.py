@@ -231,7 +231,7 @@ def run(options: Options) -> None:
     stages = history.seconds
     seconds = {
         "data": loaded - started + sum(stages.get(k, 0) for k in _LOADING),
-        "prefit": stages["prefit"],
+        "prefit": stages.get("prefit", 0.0),
         "compile": stages.get("compile", 0.0),
         "train": sum(stages.get(k, 0) for k in _TRAINING),
         "evaluate": evaluated - fitted,

@@ -137,14 +137,15 @@ class _ProgressLines:
 
     def __init__(self, what: str, total: int | None, unit: str):
         self.what, self.total, self.unit = what, total, unit
-        self.n, self.postfix = 0, ""
+        self.n = self.counted = 0  # so far, and in the last line
+        self.postfix = ""
         self.began = self.shown = time.perf_counter()
 
     def __enter__(self) -> _ProgressLines:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self.shown > self.began:
+        if self.shown > self.began and self.n > self.counted:
             self._show(time.perf_counter())
 
     def set_postfix(self, **values: str) -> None:
@@ -159,7 +160,7 @@ class _ProgressLines:
             self._show(now)
 
     def _show(self, now: float) -> None:
-        self.shown, spent = now, now - self.began
+        self.shown, self.counted, spent = now, self.n, now - self.began
         left = ""
         if self.total and 0 < self.n < self.total:
             left = f", {spent / self.n * (self.total - self.n):.0f} s left"

@@ -230,9 +230,9 @@ def _read(source: Source, options: ReadOptions) -> Motion:
 def _refuse_smpl(body_pose: np.ndarray, where: str | Path) -> None:
     if body_pose.shape[-1:] == (32,):
         raise ValueError(
-            f"{where}: body_pose has shape {body_pose.shape}: 32 numbers are an embedding of a pose "
-            "prior (VPoser), not rotations of joints. Decode it with that prior, and save the 63 "
-            "numbers of body_pose that it gives."
+            f"{where}: body_pose has shape {body_pose.shape}: 32 numbers are an embedding of a "
+            "pose prior (VPoser), not rotations of joints. Decode it with that prior, and save the "
+            "63 numbers of body_pose that it gives."
         )
     if body_pose.shape[-1:] == (69,) or 23 in body_pose.shape[-3:]:
         raise ValueError(

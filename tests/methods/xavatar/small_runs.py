@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -94,3 +94,22 @@ def same(a: Any, b: Any) -> bool:
     """Whether all leaves are equal, bit for bit."""
     leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.array_equal(x, y) for x, y in leaves)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A body, three frames of it, a config, the model at step 0, its table, and the data."""
+
+    body: xa.BodyModel
+    frames: xa.Frames
+    config: xa.FitConfig
+    model: Any
+    table: Any
+    data: Any
+
+    def fit(self, frames=None, config=None, **options):
+        """`fit` without the fit to the mean shape: what it starts from is tested elsewhere."""
+        frames = self.frames if frames is None else frames
+        config = self.config if config is None else config
+        options = {"model": self.model, "body": self.body, "verbose": False, **options}
+        return xa.fit(frames, config, **options)

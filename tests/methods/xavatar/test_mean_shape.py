@@ -92,7 +92,7 @@ def test_a_network_is_fitted_to_the_persons_joints_and_surface(toy_body, config)
 
     def weights(losses):
         return fit_weights(
-            drawn, toy_body, betas, steps=60, losses=losses, optimiser=config.optimiser, seed=0
+            drawn, toy_body, betas, steps=3000, losses=losses, optimiser=config.optimiser, seed=0
         )
 
     def error(model):

@@ -325,8 +325,8 @@ def test_validation_is_the_loss_at_the_roots_of_the_held_frames(case):
     assert float(loss(case.model, data)) == pytest.approx(expected, rel=0.2)
 
 
-def test_the_validation_loss_does_not_fall_as_roots_vanish_or_the_map_folds(stored):
-    """Points inside that lose their root count as outside; folded ones keep their loss."""
+def test_the_validation_loss_does_not_fall_as_roots_vanish(stored):
+    """A point that loses its root counts with the last place of that root."""
     data, _ = stored
     deep = replace(data, samples=data.samples._replace(distance=jnp.full((2, 5), 0.02)))
     model = model_of()
@@ -334,19 +334,11 @@ def test_the_validation_loss_does_not_fall_as_roots_vanish_or_the_map_folds(stor
     from xavatar_jax.methods.xavatar.stages import ValidationLoss
 
     loss = ValidationLoss(DrawCached(rows), model.link)
-    before = float(loss(model, deep))
     gone = eqx.tree_at(
         lambda d: (d.roots.valid, d.roots.others_valid), deep,
         (jnp.zeros((2, 5), bool), jnp.zeros((2, 3, 2), bool)),
     )  # fmt: skip
-    outside = divergence(np.array(-10.0), np.array(0.02))
-    np.testing.assert_allclose(loss(model, gone), outside, rtol=1e-6)
-    assert outside > before or before > 5
-    # A skinning field that is so sharp at the roots that the map folds there.
-    at_fold = eqx.tree_at(lambda d: d.roots.first, deep, deep.roots.first.at[..., 0].set(0.0))
-    at_fold = eqx.tree_at(
-        lambda d: d.roots.others_valid, at_fold, jnp.zeros((2, 3, 2), bool)
-    )  # fmt: skip
-    flat = float(loss(model_of(1e-6), at_fold))
-    for sharp in (2.5, 2.5001, 400.0):
-        np.testing.assert_allclose(loss(model_of(sharp), at_fold), flat, rtol=1e-6)
+    first = eqx.tree_at(lambda d: d.roots.others_valid, deep, jnp.zeros((2, 3, 2), bool))
+    np.testing.assert_allclose(loss(model, gone), loss(model, first), rtol=1e-6)
+    # Of several roots the most inside one counts: losing the others cannot help.
+    assert float(loss(model, gone)) >= float(loss(model, deep)) > 0

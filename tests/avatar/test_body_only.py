@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import TOLERANCE, TREES
-from xavatar_jax.baselines import (
-    Baseline,
+
+import xavatar_jax as xa
+from xavatar_jax.avatar import (
+    Avatar,
+    BodyOnlyAvatar,
+    Drivable,
     body_only,
     body_only_frames,
     body_only_params,
     kept_joints,
 )
-from xavatar_jax.training import History
-
-import xavatar_jax as xa
-from xavatar_jax.avatar import Avatar
 from xavatar_jax.body import canonical_pose, pose_body
+from xavatar_jax.fields import GeometrySpec, MLPShape, ModelSpec, SkinningSpec, build_model
 from xavatar_jax.frames import Frames
 from xavatar_jax.kinematics import KinematicTree
 
@@ -122,21 +122,23 @@ def test_parameters_of_another_tree_are_refused(family, rng):
         body_only_params(cut, posed(family["mano"], rng))
 
 
-def test_a_baseline_is_asked_in_the_poses_of_the_whole_body(family, rng):
+def test_an_avatar_takes_parameters_of_the_whole_body(family, rng, monkeypatch):
     body = family["smplx"]
     cut = body_only(body)
-    asked = []
+    tiny = MLPShape(width=8, depth=1, octaves=0, skip=(), condition_at=())
+    spec = ModelSpec(SkinningSpec(kind="mlp", mlp=tiny), GeometrySpec(kind="mlp", mlp=tiny))
+    model = build_model(spec, cut, key=jax.random.key(0))
+    betas = rng.standard_normal(4).astype(np.float32)
+    avatar = BodyOnlyAvatar(body, Avatar(cut, betas, model, spec, steps=7, method="snarf"))
+    asked, made = [], xa.Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
 
-    def mesh(params, mode):
+    def mesh(self, params, *, mode):
         asked.append((params, mode))
-        return "mesh"
+        return made
 
-    betas = rng.standard_normal(4)
-    avatar = SimpleNamespace(body=cut, betas=betas, mesh=mesh)
-    frames = Frames(posed(body, rng, batch=(1,)), lambda i: None, body=body)  # pyright: ignore
-    baseline = Baseline(body, avatar, History(), frames)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr(Avatar, "mesh", mesh)
     params = posed(body, rng)
-    assert baseline.mesh(params, mode="full") == "mesh"
+    assert avatar.surface(params, mode="full") is made
     np.testing.assert_array_equal(asked[0][0].pose, params.pose[:22])
     assert asked[0][1] == "full"
     own = xa.BodyParams.create(
@@ -144,6 +146,8 @@ def test_a_baseline_is_asked_in_the_poses_of_the_whole_body(family, rng):
         expression=params.expression,
     )  # fmt: skip
     np.testing.assert_allclose(
-        baseline.posed_template(params), pose_body(body, own).vertices, atol=TOLERANCE["body_m"]
+        avatar.posed_template(params), pose_body(body, own).vertices, atol=TOLERANCE["body_m"]
     )
-    assert not isinstance(baseline, Avatar)
+    assert isinstance(avatar, Drivable)
+    assert not isinstance(avatar, Avatar)
+    assert (avatar.steps, avatar.method) == (7, "snarf")

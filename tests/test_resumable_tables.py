@@ -13,7 +13,7 @@ import pytest
 import xavatar_jax as xa
 from xavatar_jax.frames import frames_from_params
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_a_body_judged_by_itself_is_near(resumable):
         def __init__(self):
             self.body = body
 
-        def mesh(self, params, *, mode="fast"):
+        def surface(self, params, *, mode="fast"):
             return xa.Mesh(np.asarray(frames[0].vertices), np.asarray(frames[0].faces))
 
         def posed_template(self, params):
