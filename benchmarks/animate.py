@@ -156,9 +156,9 @@ def main() -> None:
     avatar = xa.load_avatar(args.avatar, body=body)
     rows, exports, base = [], [], {}
     if not args.surface:
-        rows, exports, base = measure_motion(avatar, args.quick)
+        rows, exports, base = measure_motion(avatar, args.quick)  # pyright: ignore[reportArgumentType]
     sizes = list(CELLS)[:1] if args.quick else CELLS
-    extractions = [measure_extraction(avatar, cells) for cells in sizes]
+    extractions = [measure_extraction(avatar, cells) for cells in sizes]  # pyright: ignore[reportArgumentType]
     header = {
         "question": "frames a second of animation, distance to exact frames, time of export",
         **describe_machine(),

@@ -120,11 +120,11 @@ def main() -> None:
     options = parser.parse_args()
     avatar = xa.load_avatar(options.avatar)
     frames = xa.synthetic_capture(body=avatar.body).test.sequences["signs_and_piano"]
-    rows = [] if options.no_viewer else viewer_rows(avatar, frames)
+    rows = [] if options.no_viewer else viewer_rows(avatar, frames)  # pyright: ignore[reportArgumentType]
     frame = frames[len(frames) // 2]
     mesh = avatar.animate(frame.params)[0].compute_normals()
     if options.pictures is not None:
-        draw(avatar, frame, mesh, options.pictures)
+        draw(avatar, frame, mesh, options.pictures)  # pyright: ignore[reportArgumentType]
     rows = [*picture_rows(mesh), *rows]
     print_rows(rows, ("what", "seconds", "processor_s"))
     header = {

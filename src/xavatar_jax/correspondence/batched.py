@@ -115,7 +115,7 @@ class _Driver(NamedTuple):
 
         def init(y: Array, a: PyTree) -> Any:
             structs = jax.eval_shape(self.fn, y, a)
-            return self.solver.init(self.fn, y, a, self.options(y, a), *structs, frozenset())
+            return self.solver.init(self.fn, y, a, self.options(y, a), *structs, frozenset())  # pyright: ignore[reportCallIssue]
 
         # What is no array in a solver's state is the same in all lanes and steps.
         state, static = eqx.partition(eqx.filter_vmap(init)(y, args), eqx.is_array)

@@ -102,7 +102,7 @@ def find_correspondences(
             fixed if implicit else args,
             options,
             max_steps=max_steps,
-            adjoint=optx.ImplicitAdjoint() if implicit else adjoint,
+            adjoint=optx.ImplicitAdjoint() if implicit else adjoint,  # pyright: ignore[reportArgumentType]
             throw=throw,
         )
         # Mask inside the mapped function: derivatives of a failed solve are finite and wrong.

@@ -30,7 +30,7 @@ class HashEncoding(eqx.Module):
     origin: Float[Array, "3"] = stored()
     shapes: Int[Array, "levels 3"] = stored()
     offsets: Int[Array, " levels+1"] = stored()
-    spacing: tuple[float, ...] = eqx.field(static=True)
+    spacing: tuple[float, ...] = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class ExpressionGrid(eqx.Module):
     table: Float[Array, "N E K"]
     low: Float[Array, "3"] = stored()
     shape: Int[Array, "3"] = stored()
-    spacing: float = eqx.field(static=True)
+    spacing: float = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
 
     def __init__(
         self,

@@ -78,9 +78,9 @@ class HashGeometry(AbstractGeometryField):
     expression_range: Float[Array, "2 E"] = stored()
     detail_low: Float[Array, "boxes 3"] = stored()
     detail_high: Float[Array, "boxes 3"] = stored()
-    detail_spacing: tuple[float, ...] = eqx.field(static=True)
-    trunk_spacing: float = eqx.field(static=True)
-    sharpness: float = eqx.field(static=True)
+    detail_spacing: tuple[float, ...] = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
+    trunk_spacing: float = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
+    sharpness: float = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
 
     def __init__(
         self,

@@ -70,7 +70,7 @@ class GridSkinning(AbstractSkinningField):
     correction: Float[Array, "M L"] = learned()
     grids: PartGrids = fixed()
     correction_grids: PartGrids = stored()
-    tree: KinematicTree = eqx.field(static=True)
+    tree: KinematicTree = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
 
     def __call__(self, x_c: Float[Array, "3"]) -> Float[Array, " J"]:
         base = self.grids.interpolate(jax.lax.stop_gradient(self.template), x_c)

@@ -279,7 +279,7 @@ def _binary_element(
         )
         if same:
             columns = {p[0]: rows[f"{i}:{p[0]}"] for i, p in enumerate(element.properties)}
-            return columns, place + size
+            return columns, place + size  # pyright: ignore[reportReturnType]
     if all(length is None for _, _, length in element.properties):
         raise _short(element)
     return _binary_rows(data, place, element, order)

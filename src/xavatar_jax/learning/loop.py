@@ -210,7 +210,7 @@ class _Loop:
         self.at += 1
         previous, self.unchecked = self.unchecked, (self.at, terms)
         self._check(previous)
-        self.latest.update(terms)
+        self.latest.update(terms)  # pyright: ignore[reportArgumentType, reportCallIssue]
         if fresh:
             self._check_all()
             self.compiled.add(stage.name)

@@ -26,7 +26,7 @@ Gradient = Callable[[Loss, Any, Any, PRNGKeyArray], tuple[tuple[Float[Array, ""]
 
 FALLING = optax.cosine_decay_schedule(1.0, 1, alpha=0.01)
 """A schedule over the run: the rates fall along a cosine to a hundredth at its end."""
-STEPWISE = optax.piecewise_constant_schedule(1.0, {0.5: 0.1, 0.75: 0.1})
+STEPWISE = optax.piecewise_constant_schedule(1.0, {0.5: 0.1, 0.75: 0.1})  # pyright: ignore[reportArgumentType]
 """A schedule over the run: the rates fall to a tenth at one half and again at three quarters."""
 CONSTANT = optax.constant_schedule(1.0)
 """A schedule over the run: the rates stay as they are."""

@@ -254,7 +254,7 @@ def _rest_frame(posed: _Posed) -> Float[np.ndarray, "3 3"] | None:
     up = rest[joints["head"]] - rest[joints["pelvis"]]
     left = rest[joints["left_hip"]] - rest[joints["right_hip"]]
     rows = [_nearest_axis(vector) for vector in (left, up)]
-    frame = np.stack([*rows, np.cross(*rows)])
+    frame = np.stack([*rows, np.cross(*rows)])  # pyright: ignore[reportArgumentType, reportCallIssue]
     return frame if np.isclose(np.linalg.det(frame), 1) else None
 
 

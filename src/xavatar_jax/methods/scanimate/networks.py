@@ -89,8 +89,8 @@ class LocalPoseMLP(AbstractPlainGeometry):
 
     mlp: ImplicitMLP
     skinning: AbstractSkinningField = stored()
-    tree: KinematicTree = eqx.field(static=True)
-    softness: float = eqx.field(static=True)
+    tree: KinematicTree = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
+    softness: float = eqx.field(static=True)  # pyright: ignore[reportGeneralTypeIssues]
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ _JITTER_M = 0.05  # of the points off the surface at which the gradient has leng
 _MARGIN_M = 0.2  # between the body and its box
 _DRAWS = 1024  # points in the box, and on its faces
 _LEAST = 1e-6  # a power below one has no derivative at zero
-_RISING = optax.piecewise_constant_schedule(1.0, {0.5: 10.0, 0.75: 10.0})
+_RISING = optax.piecewise_constant_schedule(1.0, {0.5: 10.0, 0.75: 10.0})  # pyright: ignore[reportArgumentType]
 
 
 class SkinNets(eqx.Module):
@@ -307,7 +307,7 @@ def eikonal_term(geometry: Any, out: Shaped, key: Any) -> Float[Array, ""]:
 def offset_term(geometry: Any, out: Shaped, key: Any) -> Float[Array, ""]:
     """The distance at a step along the normal is that step."""
     assert out.beside is not None
-    return jnp.abs(out.beside - out.step).mean()
+    return jnp.abs(out.beside - out.step).mean()  # pyright: ignore[reportOperatorIssue]
 
 
 _SHAPE_TERMS = {

@@ -184,13 +184,13 @@ def _take(
     def take(leaf: Array) -> Array:
         return leaf[chosen[:, None], rows]
 
-    x_d = take(data.samples.x_d)
+    x_d = take(data.samples.x_d)  # pyright: ignore[reportArgumentType]
     x_c, found = map(take, root) if root else (x_d, jnp.ones(rows.shape, bool))
     return PointBatch(
         x_d,
         x_c,
-        take(data.samples.part).astype(jnp.int32),
-        take(data.samples.distance),
+        take(data.samples.part).astype(jnp.int32),  # pyright: ignore[reportArgumentType]
+        take(data.samples.distance),  # pyright: ignore[reportArgumentType]
         found,
         data.transforms[chosen],
         jax.tree.map(lambda leaf: leaf[chosen], data.params),
