@@ -76,8 +76,8 @@ def viewer_rows(avatar: xa.Avatar, frames: xa.Frames) -> list[dict[str, Any]]:
         def slide(degrees: list[float] = [0.0]) -> None:  # noqa: B006
             degrees[0] += 1.0
             viewer.panel.set_turn(joint, (0.0, degrees[0], 0.0))
-            wish = viewer.panel.wish()
-            while viewer.shown != wish:
+            request = viewer.panel.request()
+            while viewer.shown != request:
                 time.sleep(0.001)
 
         moved = clock(slide, 20)

@@ -47,7 +47,7 @@ class SearchSpec:
 
     - `starts`: which bones start the search.
     - `grid`: node distances of the table of weights that is searched.
-    - `keep`: at most so many roots per point.
+    - `keep`: largest number of roots per point.
     - `atol`: residual of a root on the skinning field, metres.
     - `max_steps`: steps of the search on the table.
     """

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..render import Camera, to_linear
 from .surfaces import Surface
 
-# The browser reloads meshes with vertex colours; the old one stays for so many seconds.
+# The browser reloads meshes with vertex colours; the old one stays this many seconds.
 _OVERLAP = 0.2
 _UNCOLORED, _COLORED = "/surface", "/colored_{}"
 

@@ -31,6 +31,7 @@ from xavatar_jax.methods.xavatar.stages import (
     PointBatch,
     RowDraw,
     SurfaceWeightsTerm,
+    ValidationLoss,
     optimiser_of,
     training_stages,
     validation_loss,
@@ -331,8 +332,6 @@ def test_the_validation_loss_does_not_fall_as_roots_vanish(stored):
     deep = replace(data, samples=data.samples._replace(distance=jnp.full((2, 5), 0.02)))
     model = model_of()
     rows = RowDraw(frames=1, points=4, several=2, held=1)
-    from xavatar_jax.methods.xavatar.stages import ValidationLoss
-
     loss = ValidationLoss(DrawCached(rows), model.link)
     gone = eqx.tree_at(
         lambda d: (d.roots.valid, d.roots.others_valid), deep,
@@ -342,3 +341,20 @@ def test_the_validation_loss_does_not_fall_as_roots_vanish(stored):
     np.testing.assert_allclose(loss(model, gone), loss(model, first), rtol=1e-6)
     # Of several roots the most inside one counts: losing the others cannot help.
     assert float(loss(model, gone)) >= float(loss(model, deep)) > 0
+
+
+def test_the_validation_loss_keeps_points_where_the_map_folds(stored):
+    """They count with the root that was found, which is at the fold itself, x = 0."""
+    data, _ = stored
+    cache = replace(data.roots, first=jnp.zeros((2, 5, 3)), others_valid=jnp.zeros((2, 3, 2), bool))
+    deep = replace(
+        data, roots=cache, samples=data.samples._replace(distance=jnp.full((2, 5), 0.02))
+    )
+    loss = ValidationLoss(
+        DrawCached(RowDraw(frames=1, points=4, several=2, held=1)), Occupancy(SOFT)
+    )
+    expected = divergence(EXPRESSION[1, 0], 0.02)
+    # The slope of the map at x = 0 is 1 - shift * sharp / 2.
+    for slope in (0.0, -0.025, 0.04):
+        sharp = 2 * (1 - slope) / SHIFT[1]
+        np.testing.assert_allclose(loss(model_of(sharp), deep), expected, rtol=1e-6)

@@ -14,7 +14,7 @@ from ..xavatar.config import FitConfig, paper
 class StagePlan:
     """One of the three stages.
 
-    - `steps`, `share`: it ends after so many steps, or after its share of the minutes that are
+    - `steps`, `share`: the stage ends after these steps, or after its share of the minutes that are
       left once the scans are read (of shares that sum to one).
     - `frames` a step, and `points` of each: triangles of a scan.
     - `rate`: of learning; "cosine" falls to a hundredth, "steps" to a tenth at one half and again
@@ -86,7 +86,7 @@ class ScanimateConfig:
       it learns what is to be added to the logarithm of the weights at the body's nearest point.
     - `hands`: in stage 3 those of the body, fingers in the mean pose of the frames, or the scans',
       which a body-only skeleton leaves where they are.
-    - `stretch`: a triangle with an edge that becomes so many times longer or shorter in canonical
+    - `stretch`: a triangle with an edge that becomes this many times longer or shorter in canonical
       space is left out of stage 3: it spans parts that only touch.
     """
 

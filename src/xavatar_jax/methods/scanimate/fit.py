@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ...avatar import Avatar, BodyOnlyAvatar, body_only, body_only_frames
 from ...body import BodyModel, canonical_vertices
-from ...fields import AvatarModel, build_model, lay_on_person
+from ...fields import AvatarModel, build_model
 from ...frames import Frames, known_body
 from ...learning import (
     ONE_DEVICE,
@@ -35,7 +35,7 @@ from ...learning import (
 )
 from ..observations import choose_frames, frames_digest, subject_betas
 from ..result import Fit
-from ..xavatar.start import fit_mean_shape, fit_weights
+from ..xavatar.start import starting_models
 from .config import ScanimateConfig, scanimate_quick
 from .networks import InverseSkinning, LocalPoseMLP, SoftmaxSkinning
 from .scans import Scans, edge_stretch, moves_with_wrist, read_scans, static_hands
@@ -78,8 +78,8 @@ def fit_scanimate(
     betas = subject_betas(frames)
     history = History(frames=len(learned))
 
-    start = start_model(cut, betas, config, cache=cache, verbose=verbose)
-    clock = history.lap("prefit", started)
+    start = start_model(cut, betas, config, history=history, cache=cache, verbose=verbose)
+    clock = time.perf_counter()
     with progress("scans", len(learned_from), verbose=verbose, unit="frame") as bar:
         scans = read_scans(
             cut, learned_from, betas, triangles=config.triangles, seed=config.seed, bar=bar
@@ -152,6 +152,7 @@ def start_model(
     betas: Float[np.ndarray, " S"],
     config: ScanimateConfig,
     *,
+    history: History | None = None,
     cache: str | os.PathLike[str] | None = None,
     verbose: bool = True,
 ) -> AvatarModel:
@@ -168,16 +169,10 @@ def start_model(
             key=key_distance,
         )  # fmt: skip
         model = replace(model, geometry=distance)
-    model = fit_mean_shape(
-        model, start.spec, body, steps=start.prefit_steps, optimiser=start.optimiser,
-        seed=config.seed, cache=cache, verbose=verbose,
+    _, model = starting_models(
+        model, start, body, betas, seed=config.seed,
+        history=History() if history is None else history, cache=cache, verbose=verbose,
     )  # fmt: skip
-    model = lay_on_person(model, start.spec, body, betas, key=key)
-    if start.weights_steps and start.learn_skinning and not start.spec.skinning.knows_template:
-        model = fit_weights(
-            model, body, betas, steps=start.weights_steps, losses=start.losses,
-            optimiser=start.optimiser, seed=config.seed, verbose=verbose,
-        )  # fmt: skip
     return model
 
 

@@ -38,8 +38,8 @@ class SearchConfig:
     - `starts`: the bones that start a point's search.
     - `cached`: search once, on the tabulated field, when points are drawn, and polish the roots
       between steps; otherwise search in every training step.
-    - `guide_every`: a search in the step runs on a table of the field first, which is renewed
-      every so many steps (0: no table).
+    - `guide_every`: steps between two renewals of the table on which a search in the step begins
+      (0: no table).
     - `grid`: the grids of the table; `keep`: roots kept for a point; `atol`: metres.
     """
 
@@ -112,17 +112,17 @@ class FitConfig:
     - `steps`, `minutes`: whichever ends first; `minutes` counts from the call of `fit`.
     - `train_frames`: frames to learn from, chosen for their variety (0: all). Memory grows with
       their number, not with that of the frames they are chosen from.
-    - `frames_per_minute`: with `minutes`, at most so many frames for each minute after the first
+    - `frames_per_minute`: limit on the frames for each of the `minutes` after the first
       (0: no limit).
     - `points`: how many points of a frame are drawn, and where.
     - `frames_per_step`, `points_per_step` (of each frame).
     - `learn_skinning`: whether the skinning field is learned.
-    - `skinning_every`, `skinning_points`: with cached roots, the skinning field takes every so
-      many steps, from so many points a frame; the other steps update the geometry.
-    - `polish_every`, `polish_frames`: every so many steps, the cached roots of the next so many
-      frames follow the skinning field.
-    - `redraw_every`, `redraw_frames`: every so many steps, the points of the next so many frames
-      are drawn again (0: never).
+    - `skinning_every`, `skinning_points`: with cached roots, steps between two updates of the
+      skinning field, and points of each frame in such a step. The other steps update the geometry.
+    - `polish_every`, `polish_frames`: steps between two rounds in which cached roots follow the
+      skinning field, and frames in a round.
+    - `redraw_every`, `redraw_frames`: steps between two rounds in which points are drawn again
+      (0: never), and frames in a round.
     - `prefit_steps`: steps that fit the model to the body's mean shape first; the result is cached.
     - `weights_steps`: steps that then fit a skinning network to the person's joints and surface
       before any root is searched. Template grids need none.

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +19,10 @@ from ...body import BodyModel, check_params
 from ...correspondence import start_table
 from ...fields import (
     AvatarModel,
+    PartGrids,
+    TabulatedSkinning,
     build_model,
     grids_for_search,
-    lay_on_person,
     learned_leaves,
 )
 from ...files import load_header, unflatten_named
@@ -60,7 +62,7 @@ from ..result import Fit
 from .config import FitConfig, quick
 from .roots import FrameData, RootCache, frame_data, search_roots, tabulated
 from .stages import training_stages, validation_loss
-from .start import fit_mean_shape, fit_weights
+from .start import starting_models
 from .upkeep import GuideRenewal, Redraw, RootPolish
 
 # What a resumed run may change: how long it is, and how large its steps are.
@@ -150,9 +152,12 @@ def fit(
 
     redraw = None
     try:
-        initial, start = _starting_models(
-            model, config, body, betas, history, cache=cache, verbose=verbose
-        )
+        initial = start = model
+        if model is None:
+            initial, start = starting_models(
+                build_model(spec, body, key=jax.random.key(config.seed)), config, body, betas,
+                seed=config.seed, history=history, cache=cache, verbose=verbose,
+            )  # fmt: skip
         geometry = start.geometry.within(frames[learned].params)
         start = eqx.tree_at(lambda m: m.geometry, start, geometry)
         preparation = _Preparation(body, start, betas, config)
@@ -200,44 +205,23 @@ def fit(
     return finished(done.model, history)
 
 
-def _starting_models(
-    model: AvatarModel | None,
-    config: FitConfig,
-    body: BodyModel,
-    betas: np.ndarray,
-    history: History,
-    *,
-    cache: str | os.PathLike[str] | None,
-    verbose: bool,
-) -> tuple[AvatarModel, AvatarModel]:
-    """The model at step 0, of the mean shape, and the one that training starts from."""
-    if model is not None:
-        return model, model
-    clock, spec, key = time.perf_counter(), config.spec, jax.random.key(config.seed)
-    initial = fit_mean_shape(
-        build_model(spec, body, key=key), spec, body,
-        steps=config.prefit_steps, optimiser=config.optimiser, seed=config.seed,
-        cache=cache, verbose=verbose,
-    )  # fmt: skip
-    clock = history.lap("prefit", clock)
-    start = lay_on_person(initial, spec, body, betas, key=key)
-    if config.learn_skinning and config.weights_steps and not spec.skinning.knows_template:
-        start = fit_weights(
-            start, body, betas, steps=config.weights_steps, losses=config.losses,
-            optimiser=config.optimiser, seed=config.seed, verbose=verbose,
-        )  # fmt: skip
-    history.lap("weights", clock)
-    return initial, start
-
-
 class _Preparation:
     """Makes training data of frames: labelled points and, if they are cached, their roots."""
 
     def __init__(self, body: BodyModel, start: AvatarModel, betas: Any, config: FitConfig):
         self.body, self.start = body, start
         self.plan, self.search, self.seed = config.points, config.search, config.seed
-        self.grids = grids_for_search(start.skinning, body, betas, config.search.grid)
-        self.table = tabulated(start.skinning, self.grids)
+        self._betas = betas
+
+    @cached_property
+    def grids(self) -> PartGrids:
+        """Where the skinning field is tabulated."""
+        return grids_for_search(self.start.skinning, self.body, self._betas, self.search.grid)
+
+    @cached_property
+    def table(self) -> TabulatedSkinning:
+        """The skinning field that training starts from, tabulated."""
+        return tabulated(self.start.skinning, self.grids)
 
     def label(
         self, frames: Frames, places: Any, *, number: int = 0, bar: Any = None, check: Any = None

@@ -218,8 +218,8 @@ def _polish(
 def replace_frames(data: FrameData, new: FrameData, rows: Int[np.ndarray, " r"]) -> FrameData:
     """The data with the samples and roots of some frames replaced.
 
-    There is room for so many rows with several roots: of a frame with more, the last ones keep
-    their first root alone.
+    The room for rows with several roots is fixed: in a frame with more, the last ones keep only
+    their first root.
     """
     return _replace(data, _padded_like(data, new), jnp.asarray(rows))
 

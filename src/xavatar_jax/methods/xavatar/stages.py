@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -83,16 +84,33 @@ class RowDraw(NamedTuple):
         return jax.random.randint(key, (self.frames,), 0, data.num_frames - self.held)
 
 
-class DrawCached(eqx.Module):
-    """Draws points whose roots are cached, and of several roots takes the most inside one."""
+class AbstractDraw(eqx.Module):
+    """Draws points of random frames, with the root that counts for each point.
 
-    rows: RowDraw = eqx.field(static=True)
-    devices: Devices = eqx.field(static=True, default=ONE_DEVICE)
-    lost_is_outside: ClassVar[bool] = False  # a lost root stays where it was seen last
+    `lost_is_outside`: whether a point without a root counts as outside in validation; otherwise
+    its root stays where it was seen last.
+    """
+
+    rows: eqx.AbstractVar[RowDraw]
+    lost_is_outside: eqx.AbstractClassVar[bool]
 
     def __call__(self, model: AvatarModel, data: FrameData, key: PRNGKeyArray) -> PointBatch:
         frame_key, key = jax.random.split(key)
         return self.of_frames(model, data, self.rows.chosen(data, frame_key), key)
+
+    @abc.abstractmethod
+    def of_frames(
+        self, model: AvatarModel, data: FrameData, chosen: Int[Array, " B"], key: PRNGKeyArray
+    ) -> PointBatch:
+        """Random points of these frames."""
+
+
+class DrawCached(AbstractDraw):
+    """Draws points whose roots are cached, and of several roots takes the most inside one."""
+
+    rows: RowDraw = eqx.field(static=True)
+    devices: Devices = eqx.field(static=True, default=ONE_DEVICE)
+    lost_is_outside: ClassVar[bool] = False
 
     def of_frames(
         self, model: AvatarModel, data: FrameData, chosen: Int[Array, " B"], key: PRNGKeyArray
@@ -125,7 +143,7 @@ class DrawCached(eqx.Module):
         return batch._replace(x_c=x_c, found=found)
 
 
-class DrawAndSearch(eqx.Module):
+class DrawAndSearch(AbstractDraw):
     """Draws points and searches their roots on the model itself (X-Avatar, section 3.3)."""
 
     starts: StartTable
@@ -135,10 +153,6 @@ class DrawAndSearch(eqx.Module):
     max_steps: int = eqx.field(static=True)
     devices: Devices = eqx.field(static=True, default=ONE_DEVICE)
     lost_is_outside: ClassVar[bool] = True
-
-    def __call__(self, model: AvatarModel, data: FrameData, key: PRNGKeyArray) -> PointBatch:
-        frame_key, key = jax.random.split(key)
-        return self.of_frames(model, data, self.rows.chosen(data, frame_key), key)
 
     def of_frames(
         self, model: AvatarModel, data: FrameData, chosen: Int[Array, " B"], key: PRNGKeyArray
@@ -457,7 +471,7 @@ class ValidationLoss(eqx.Module):
     search finds nothing counts as outside.
     """
 
-    draw: DrawCached | DrawAndSearch
+    draw: AbstractDraw
     link: AbstractLink
 
     def __call__(self, model: AvatarModel, data: FrameData) -> Float[Array, ""]:

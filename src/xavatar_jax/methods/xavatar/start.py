@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +17,18 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..._version import __version__
 from ...body import BodyModel, BodyParams
-from ...fields import AvatarModel, ModelSpec, grid_vertices, template_weights
+from ...fields import (
+    AvatarModel,
+    ModelSpec,
+    grid_vertices,
+    lay_on_person,
+    template_weights,
+)
 from ...files import cache_path, flatten_named, load_arrays, save_arrays, unflatten_named
 from ...geometry import face_areas
-from ...learning import FALLING, Schedule, Stage, notify, train
+from ...learning import FALLING, History, Schedule, Stage, notify, train
 from ...sampling import signed_distance
-from .config import LossConfig, OptimiserConfig
+from .config import FitConfig, LossConfig, OptimiserConfig
 from .stages import LearnsParts, optimiser_of, weight_terms
 
 _REVISION = 4  # raised when the fit below changes: it is part of the cache's key
@@ -188,3 +195,34 @@ def fit_weights(
     )
     schedule = Schedule(steps, seed=seed)
     return train(model, None, [stage], schedule, verbose=verbose, name="weights").model
+
+
+def starting_models(
+    model: AvatarModel,
+    config: FitConfig,
+    body: BodyModel,
+    betas: Float[np.ndarray, " S"],
+    *,
+    seed: int,
+    history: History,
+    cache: str | os.PathLike[str] | None = None,
+    verbose: bool = True,
+) -> tuple[AvatarModel, AvatarModel]:
+    """The model at step 0, fitted to the mean shape, and the one for the person.
+
+    `model` is as for `fit_mean_shape`.
+    """
+    clock, spec = time.perf_counter(), config.spec
+    initial = fit_mean_shape(
+        model, spec, body, steps=config.prefit_steps, optimiser=config.optimiser, seed=seed,
+        cache=cache, verbose=verbose,
+    )  # fmt: skip
+    clock = history.lap("prefit", clock)
+    start = lay_on_person(initial, spec, body, betas, key=jax.random.key(seed))
+    if config.learn_skinning and config.weights_steps and not spec.skinning.knows_template:
+        start = fit_weights(
+            start, body, betas, steps=config.weights_steps, losses=config.losses,
+            optimiser=config.optimiser, seed=seed, verbose=verbose,
+        )  # fmt: skip
+    history.lap("weights", clock)
+    return initial, start
