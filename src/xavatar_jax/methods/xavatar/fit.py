@@ -152,8 +152,9 @@ def fit(
 
     redraw = None
     try:
-        initial = start = model
-        if model is None:
+        if model is not None:
+            initial = start = model
+        else:
             initial, start = starting_models(
                 build_model(spec, body, key=jax.random.key(config.seed)), config, body, betas,
                 seed=config.seed, history=history, cache=cache, verbose=verbose,

@@ -432,12 +432,12 @@ def training_stages(
 
     if not search.cached:
         draw = DrawAndSearch(
-            start_table(body, search.starts),
-            RowDraw(frames, points, 0, held),
-            search.keep,
-            search.atol,
-            search.max_steps,
-            devices,
+            starts=start_table(body, search.starts),
+            rows=RowDraw(frames, points, 0, held),
+            keep=search.keep,
+            atol=search.atol,
+            max_steps=search.max_steps,
+            devices=devices,
         )
         level = LevelTerm(through_root=learn_skinning)
         terms = {"occupancy": (1.0, level), "bone": bone, **on_weights, "found": (0.0, FoundTerm())}
