@@ -31,6 +31,7 @@ from xavatar_jax.fields import (
     lay_on_person,
     learned,
     learned_leaves,
+    mean_shape_model,
     stack_models,
     stored,
     stored_leaves,
@@ -151,7 +152,7 @@ def randomize(geometry):
 
 def test_a_model_laid_on_a_person_is_the_one_built_for_it(people, toy_body):
     models, betas = people
-    mean = build_model(SPEC, toy_body, key=jax.random.key(0))
+    mean = mean_shape_model(SPEC, toy_body, key=jax.random.key(0), betas=betas[0])
     laid = lay_on_person(mean, SPEC, toy_body, betas[0], key=jax.random.key(0))
     assert eqx.tree_equal(laid, models[0])
     table = mean.geometry.encoding.table + 1

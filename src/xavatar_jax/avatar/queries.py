@@ -214,12 +214,12 @@ def colors(model: AvatarModel, points: Array, condition: Any) -> Float[Array, "N
 def project(model: AvatarModel, points: Array, condition: Any) -> Float[Array, "N 3"]:
     """Move points of the neutral surface to the surface of a condition.
 
-    From where the condition carries them, by three Newton steps along the gradient of at most
-    3 mm each.
+    By three Newton steps along the gradient of at most 3 mm each. The neutral points are moved,
+    and carried at the end: the inverse of `carry` costs more than the field.
     """
 
     def value(x: Array) -> Array:
-        return model.geometry(x, condition).level
+        return model.geometry.carried_value(x, condition).level
 
     def step(_: int, x: Array) -> Array:
         f, g = jax.value_and_grad(value)(x)
@@ -227,7 +227,7 @@ def project(model: AvatarModel, points: Array, condition: Any) -> Float[Array, "
         return x - g / slope * jnp.clip(f / slope, -_PROJECT_STEP, _PROJECT_STEP)
 
     def one(x: Array) -> Array:
-        return jax.lax.fori_loop(0, _PROJECT_STEPS, step, model.geometry.carry(x, condition))
+        return model.geometry.carry(jax.lax.fori_loop(0, _PROJECT_STEPS, step, x), condition)
 
     return jax.vmap(one)(points)
 

@@ -4,6 +4,7 @@ from .build import build_link as build_link
 from .build import build_model as build_model
 from .build import grids_for_search as grids_for_search
 from .build import lay_on_person as lay_on_person
+from .build import mean_shape_model as mean_shape_model
 from .color import AbstractColorField as AbstractColorField
 from .feature_grids import ExpressionGrid as ExpressionGrid
 from .feature_grids import HashEncoding as HashEncoding

@@ -16,7 +16,7 @@ from .grids import GridSpacing, PartGrids
 from .hash_geometry import HashGeometry
 from .link import AbstractLink, Occupancy, SignedDistance
 from .model import AvatarModel
-from .skinning import AbstractSkinningField, GridSkinning, MLPSkinning
+from .skinning import AbstractSkinningField, MLPSkinning
 from .spec import GeometrySpec, LinkSpec, ModelSpec, SkinningSpec
 from .template import (
     body_part_grids,
@@ -37,7 +37,7 @@ def build_model(
 ) -> AvatarModel:
     """A model before any fit: a function of spec, body and key.
 
-    It is laid out for the body's mean shape, or with `betas` as `lay_on_person` leaves it.
+    It is laid out for the body's mean shape, or for the person of `betas`.
     """
     key_skinning, key_geometry = jax.random.split(key)
     return AvatarModel(
@@ -47,27 +47,37 @@ def build_model(
     )
 
 
+def mean_shape_model(
+    spec: ModelSpec, body: BodyModel, *, key: PRNGKeyArray, betas: _Betas
+) -> AvatarModel:
+    """A person's model whose geometry is laid out for the body's mean shape, to be fitted there.
+
+    `lay_on_person` then makes it what `build_model` gives, but for what was fitted.
+    """
+    key_skinning, key_geometry = jax.random.split(key)
+    return AvatarModel(
+        _skinning(body, spec.skinning, key_skinning, betas),
+        _geometry(body, spec.geometry, key_geometry, None),
+        build_link(spec.link),
+    )
+
+
 def lay_on_person(
     model: AvatarModel, spec: ModelSpec, body: BodyModel, betas: _Betas, *, key: PRNGKeyArray
 ) -> AvatarModel:
-    """A model that was fitted to the mean shape, laid out for a person instead.
+    """A model whose geometry was fitted to the mean shape, laid out for a person instead.
 
-    Skinning grids are made again around the person's own canonical body (if `spec.skinning.around`
-    is `"person"`): the template's weights are then right at the person's surface, which gradient
-    descent from the mean shape would take long to find where a hand lies some centimetres away.
     Feature grids keep what they learned, and get the person's joints, detail boxes and expression.
-    Other fields come back unchanged. `key` is that of `build_model`.
+    Other fields come back unchanged. `key` is that of `mean_shape_model`.
     """
-    key_skinning, key_geometry = jax.random.split(key)
-    skinning, geometry = model.skinning, model.geometry
-    if isinstance(skinning, GridSkinning) and spec.skinning.around == "person":
-        skinning = _skinning(body, spec.skinning, key_skinning, betas)
+    _, key_geometry = jax.random.split(key)
+    geometry = model.geometry
     if isinstance(geometry, HashGeometry):
         own = _geometry(body, spec.geometry, key_geometry, betas)
         # The mean shape teaches no pose and no expression: only these have changed.
         fitted = lambda g: (g.encoding, g.hidden, g.biases)  # noqa: E731
         geometry = eqx.tree_at(fitted, own, fitted(geometry))
-    return AvatarModel(skinning, geometry, model.link, model.color)
+    return AvatarModel(model.skinning, geometry, model.link, model.color)
 
 
 def build_link(spec: LinkSpec) -> AbstractLink:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from .grids import CORNERS, lerp_weights
+from .grids import CORNERS, lerp, lerp_weights
 from .roles import misshapen, stored
 
 # Large primes, one an axis, as in Instant NGP (Müller et al., SIGGRAPH 2022).
@@ -67,7 +67,7 @@ class HashEncoding(eqx.Module):
         cell = jnp.floor(jax.lax.stop_gradient(u))
         fraction = u - cell
         corners = cell.astype(jnp.int32)[:, None, :] + CORNERS  # (levels, 8, 3)
-        return jnp.einsum("lc,lcf->lf", lerp_weights(fraction), self.table[self._rows(corners)])
+        return lerp(fraction, self.table[self._rows(corners)])
 
     def faults(self) -> Iterator[tuple[str, str]]:
         """Leaves that do not fit one another: see `check_model`."""

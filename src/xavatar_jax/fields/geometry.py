@@ -51,6 +51,10 @@ class AbstractGeometryField(eqx.Module):
         """
 
     @abc.abstractmethod
+    def carried_value(self, x: Float[Array, "3"], condition: Any) -> GeometryValue:
+        """The field at `carry(x, condition)`, without the search for what is carried there."""
+
+    @abc.abstractmethod
     def at(self, points: Float[Array, "N 3"]) -> AbstractPointCache:
         """The field at given points of the neutral person, for many conditions."""
 
@@ -92,6 +96,9 @@ class AbstractPlainGeometry(AbstractGeometryField):
     def carry(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, "3"]:
         return x_c
 
+    def carried_value(self, x: Float[Array, "3"], condition: Any) -> GeometryValue:
+        return self(x, condition)
+
     def at(self, points: Float[Array, "N 3"]) -> AbstractPointCache:
         return RecomputedPoints(self, points)
 
@@ -114,8 +121,8 @@ class RecomputedPoints(AbstractPointCache):
 
     def __call__(self, condition: Any) -> Float[Array, " N"]:
         count = len(self.points)
-        padded = jnp.pad(self.carried(condition), ((0, -count % _BATCH), (0, 0)))
-        each = jax.vmap(lambda x: self.field(x, condition).level)
+        padded = jnp.pad(self.points, ((0, -count % _BATCH), (0, 0)))
+        each = jax.vmap(lambda x: self.field.carried_value(x, condition).level)
         return jax.lax.map(each, padded.reshape(-1, _BATCH, 3)).reshape(-1)[:count]
 
     def carried(self, condition: Any) -> Float[Array, "N 3"]:

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from .roles import misshapen
@@ -139,6 +141,43 @@ def lerp_weights(fraction: Float[Array, "*p 3"]) -> Float[Array, "*p 8"]:
     """Weights of a cell's eight nodes at a position in it."""
     f = fraction[..., None, :]
     return jnp.where(CORNERS == 1, f, 1 - f).prod(-1)
+
+
+@jax.custom_jvp
+def lerp(
+    fraction: Float[Array, "levels 3"], values: Float[Array, "levels 8 F"]
+) -> Float[Array, "levels F"]:
+    """Trilinear interpolation between the values of cells' nodes."""
+    return jnp.einsum("lc,lcf->lf", lerp_weights(fraction), values)
+
+
+# The derivative with respect to the place, written out by axis: on a CPU it takes a third of the
+# time of that of the weights' product.
+@partial(lerp.defjvp, symbolic_zeros=True)
+def _lerp_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    (fraction, values), (moves, changes) = primals, tangents
+    tangent = jnp.zeros((len(values), values.shape[-1]), values.dtype)
+    if not isinstance(changes, SymbolicZero):
+        tangent = tangent + lerp(fraction, changes)
+    if not isinstance(moves, SymbolicZero):
+        corner = values.reshape(-1, 2, 2, 2, values.shape[-1])
+        x, y, z = jnp.moveaxis(fraction[..., None], 1, 0)
+
+        def between(pair: Array, share: Array) -> Array:
+            return pair[:, 0] + share * (pair[:, 1] - pair[:, 0])
+
+        along_x = corner[:, 1] - corner[:, 0]
+        at_x = between(corner, x[..., None, None])
+        along_y = at_x[:, 1] - at_x[:, 0]
+        at_y = between(at_x, y[..., None])
+        slopes = (
+            between(between(along_x, y[..., None]), z),
+            between(along_y, z),
+            at_y[:, 1] - at_y[:, 0],
+        )
+        for axis, slope in enumerate(slopes):
+            tangent = tangent + moves[:, axis, None] * slope
+    return lerp(fraction, values), tangent
 
 
 def build_part_grids(

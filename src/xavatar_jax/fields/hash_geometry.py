@@ -207,12 +207,14 @@ class HashGeometry(AbstractGeometryField):
         )
 
     def __call__(self, x_c: Float[Array, "3"], condition: LocalCondition) -> GeometryValue:
+        return self.carried_value(self.carried_from(x_c, condition)[0], condition)
+
+    def carried_value(self, x: Float[Array, "3"], condition: LocalCondition) -> GeometryValue:
         joints, centres, fade, expression, _ = condition
-        x_c, _ = self.carried_from(x_c, condition)
-        h = [self._features(x_c), _nearness(x_c, centres, fade) @ joints]
+        h = [self._features(x), _nearness(x, centres, fade) @ joints]
         if self.expressive is not None and len(expression):
             nodes = self.expressive.under(expression)
-            h.append(self.expressive.read(nodes, x_c))
+            h.append(self.expressive.read(nodes, x))
         h = jnp.concatenate(h)
         last = len(self.hidden) - 1
         for k, (weight, bias) in enumerate(zip(self.hidden, self.biases, strict=True)):

@@ -92,8 +92,10 @@ def hierarchical_softmax(
             f"{lay.num_logits}"
         )
     gates = logits[..., lay.gate]
-    passed = jax.nn.log_sigmoid(gates)
-    kept = jnp.where(lay.is_leaf, 0.0, jax.nn.log_sigmoid(-gates))
+    # The logarithms of a sigmoid and of its complement, with one exponential for both.
+    common = jnp.log1p(jnp.exp(-jnp.abs(gates)))
+    passed = jnp.minimum(gates, 0) - common
+    kept = jnp.where(lay.is_leaf, 0.0, -jnp.maximum(gates, 0) - common)
     group_logits = jnp.where(lay.sibling_mask, logits[..., lay.siblings], -jnp.inf)
     none = jnp.zeros_like(logits[..., :1])  # the group of joints that have no siblings
     if lay.sibling_mask.any():

@@ -42,8 +42,9 @@ def guided(person):
     model = eqx.tree_at(lambda m: m.skinning.correction, case.model, correction)
     grids = grids_for_search(model.skinning, case.body, np.zeros(10), case.config.search.grid)
     draw = DrawAndSearch(
-        start_table(case.body, "part_aware"), RowDraw(2, 200, 0, 0), keep=4, atol=1e-5, max_steps=15
-    )
+        starts=start_table(case.body, "part_aware"), rows=RowDraw(2, 200, 0, 0),
+        keep=4, atol=1e-5, max_steps=15,
+    )  # fmt: skip
 
     def search(guide):
         data = replace(case.data, guide=guide)
@@ -57,10 +58,10 @@ def test_roots_are_the_fields_own_whatever_the_guide_is(person, guided, stale):
     """Also where the guide is of the field some steps before."""
     model, grids, search = guided
     batch = search(tabulated((person.model if stale else model).skinning, grids))
-    found = np.asarray(batch.found)
+    found = np.asarray(batch.valid)
     assert found.mean() > 0.9
     for k in range(2):
-        x_c = np.asarray(batch.x_c[k], np.float32)
+        x_c = np.asarray(batch.root[k], np.float32)
         weights = np.asarray(jax.jit(jax.vmap(model.skinning))(x_c), np.float64)
         blended = np.einsum("nj,jab->nab", weights, np.asarray(batch.transforms[k], np.float64))
         where = np.einsum("nab,nb->na", blended[:, :3, :3], x_c) + blended[:, :3, 3]

@@ -25,10 +25,11 @@ from xavatar_jax.methods.xavatar.roots import FrameData, RootCache
 from xavatar_jax.methods.xavatar.stages import (
     BoneTerm,
     DrawCached,
+    DrawnPoints,
     FoundTerm,
     JointTerm,
+    LevelsAtRoots,
     LevelTerm,
-    PointBatch,
     RowDraw,
     SurfaceWeightsTerm,
     ValidationLoss,
@@ -137,7 +138,8 @@ def test_the_level_is_that_of_the_best_root_and_lost_points_count_for_nothing(st
     data, logit = stored
     draw = DrawCached(RowDraw(frames=4, points=9, several=5, held=0))
     model = model_of()
-    batch = draw(model, data, jax.random.key(4))
+    drawn = draw(model, data, jax.random.key(4))
+    batch = LevelsAtRoots(False, TREE)(model, drawn, KEY)
     at = np.array(rows_of(batch, data))
     assert (at[:, :, 0] == at[:, :1, 0]).all()  # a frame's points are its own
     assert (at[:, :5, 1] < 3).all()
@@ -148,18 +150,38 @@ def test_the_level_is_that_of_the_best_root_and_lost_points_count_for_nothing(st
     level = np.asarray(batch.x_c) @ SLOPE + np.asarray(batch.params.expression)
     np.testing.assert_allclose(level[found], expected[found], rtol=1e-9)
     each = divergence(expected, np.asarray(data.samples.distance)[at[..., 0], at[..., 1]])
+    np.testing.assert_allclose(np.asarray(batch.level)[found], expected[found], rtol=1e-9)
     for through in (False, True):
-        total, count = LevelTerm(through)(model, batch, KEY)
+        again = LevelsAtRoots(through, TREE)(model, drawn, KEY)
+        np.testing.assert_allclose(again.x_c, batch.x_c, atol=1e-9)
+        total, count = LevelTerm()(model, again, KEY)
         np.testing.assert_allclose(total / count, np.nanmean(each), rtol=1e-6)
     assert FoundTerm()(model, batch, KEY) == pytest.approx(found.mean())
     # Wherever a lost point stands, losses and slopes are the same.
-    elsewhere = batch._replace(x_c=jnp.where(batch.found[..., None], batch.x_c, 7.0))
+    elsewhere = drawn._replace(
+        root=jnp.where(drawn.valid[..., None], drawn.root, 7.0),
+        others=jnp.where(drawn.others_valid[..., None], drawn.others, -7.0),
+    )
 
-    def loss(model, batch):
-        total, count = LevelTerm(True)(model, batch, KEY)
-        return total / count
+    for through in (False, True):
+        loss = lambda model, drawn, t=through: level_loss(model, drawn, t)  # noqa: E731
+        assert same(*(jax.value_and_grad(loss)(model, d) for d in (drawn, elsewhere)))
 
-    assert same(*(jax.value_and_grad(loss)(model, b) for b in (batch, elsewhere)))
+
+def level_loss(model, drawn, through):
+    total, count = LevelTerm()(model, LevelsAtRoots(through, TREE)(model, drawn, KEY), KEY)
+    return total / count
+
+
+def drawn_points(x_d, root, distance, bones, params):
+    """Points with one root each."""
+    frames, points = x_d.shape[:2]
+    return DrawnPoints(
+        x_d=jnp.asarray(x_d), root=jnp.asarray(root), part=jnp.zeros((frames, points), int),
+        distance=jnp.asarray(distance), valid=jnp.ones((frames, points), bool),
+        others=jnp.zeros((frames, 0, 1, 3)), others_valid=jnp.zeros((frames, 0, 1), bool),
+        transforms=bones, params=params,
+    )  # fmt: skip
 
 
 def test_the_weight_terms_are_those_of_numpy(x64, rng):
@@ -185,8 +207,9 @@ def test_bone_points_are_inside_in_the_condition_of_every_frame(x64):
     """Shared out in turn: the first goes to the first frame, the second to the second, ..."""
     joints = jnp.asarray([[0.0, 0, 0], [0.4, 0, 0]])
     frames = jnp.zeros((2, 1, 3))
-    batch = PointBatch(frames, frames, *3 * (frames[..., 0],), bones_of(), params_of())
-    found = BoneTerm(joints, TREE)(model_of(), batch, KEY)
+    drawn = drawn_points(frames, frames, frames[..., 0], bones_of(), params_of())
+    batch = LevelsAtRoots(False, TREE, joints)(model_of(), drawn, KEY)
+    found = BoneTerm()(model_of(), batch, KEY)
     inside = np.asarray(bone_points(TREE, joints, KEY))
     of = np.arange(len(inside)) % 2
     logit = inside @ SLOPE + EXPRESSION[of, 0]
@@ -212,14 +235,10 @@ def test_the_level_follows_the_root_that_the_field_moves(x64):
     def expected(sharp):
         return divergence(root(sharp) @ SLOPE + EXPRESSION[0], distance[0]).mean()
 
-    batch = PointBatch(
-        jnp.asarray(target), jnp.asarray(root(sharp))[None], jnp.zeros((1, 2), int),
-        jnp.asarray(distance), jnp.ones((1, 2), bool), bones, params,
-    )  # fmt: skip
+    drawn = drawn_points(target, root(sharp)[None], distance, bones, params)
 
     def loss(sharp, through):
-        total, count = LevelTerm(through)(model_of(sharp), batch, KEY)
-        return total / count
+        return level_loss(model_of(sharp), drawn, through)
 
     value, slope = jax.value_and_grad(loss)(jnp.asarray(sharp), True)
     np.testing.assert_allclose(value, expected(sharp), rtol=1e-9)
@@ -332,7 +351,7 @@ def test_the_validation_loss_does_not_fall_as_roots_vanish(stored):
     deep = replace(data, samples=data.samples._replace(distance=jnp.full((2, 5), 0.02)))
     model = model_of()
     rows = RowDraw(frames=1, points=4, several=2, held=1)
-    loss = ValidationLoss(DrawCached(rows), model.link)
+    loss = ValidationLoss(DrawCached(rows), LevelsAtRoots(True, TREE), model.link)
     gone = eqx.tree_at(
         lambda d: (d.roots.valid, d.roots.others_valid), deep,
         (jnp.zeros((2, 5), bool), jnp.zeros((2, 3, 2), bool)),
@@ -350,9 +369,8 @@ def test_the_validation_loss_keeps_points_where_the_map_folds(stored):
     deep = replace(
         data, roots=cache, samples=data.samples._replace(distance=jnp.full((2, 5), 0.02))
     )
-    loss = ValidationLoss(
-        DrawCached(RowDraw(frames=1, points=4, several=2, held=1)), Occupancy(SOFT)
-    )
+    draw = DrawCached(RowDraw(frames=1, points=4, several=2, held=1))
+    loss = ValidationLoss(draw, LevelsAtRoots(True, TREE), Occupancy(SOFT))
     expected = divergence(EXPRESSION[1, 0], 0.02)
     # The slope of the map at x = 0 is 1 - shift * sharp / 2.
     for slope in (0.0, -0.025, 0.04):

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ...avatar import Avatar, BodyOnlyAvatar, body_only, body_only_frames
 from ...body import BodyModel, canonical_vertices
-from ...fields import AvatarModel, build_model
+from ...fields import AvatarModel, mean_shape_model
 from ...frames import Frames, known_body
 from ...learning import (
     ONE_DEVICE,
@@ -158,7 +158,7 @@ def start_model(
 ) -> AvatarModel:
     """Forward net and distance on a body-only skeleton, fitted to the body, laid on the person."""
     start, key = config.start, jax.random.key(config.seed)
-    model = build_model(start.spec, body, key=key)
+    model = mean_shape_model(start.spec, body, key=key, betas=betas)
     key_forward, key_distance = jax.random.split(key)
     if config.forward is not None:
         forward = SoftmaxSkinning(body.tree, config.forward, key=key_forward)

@@ -21,9 +21,9 @@ from ...fields import (
     AvatarModel,
     PartGrids,
     TabulatedSkinning,
-    build_model,
     grids_for_search,
     learned_leaves,
+    mean_shape_model,
 )
 from ...files import load_header, unflatten_named
 from ...frames import Frames, known_body, nearest_part_labels
@@ -156,7 +156,8 @@ def fit(
             initial = start = model
         else:
             initial, start = starting_models(
-                build_model(spec, body, key=jax.random.key(config.seed)), config, body, betas,
+                mean_shape_model(spec, body, key=jax.random.key(config.seed), betas=betas),
+                config, body, betas,
                 seed=config.seed, history=history, cache=cache, verbose=verbose,
             )  # fmt: skip
         geometry = start.geometry.within(frames[learned].params)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from ...sampling import VolumePoints
 POLISH_LIMIT, POLISH_TOLERANCE = 0.02, 5e-4
 """Metres: a root that has to move further in one step, or that a step leaves with a larger
 residual, has vanished."""
+_BLOCK = 2048  # points that are polished together
 
 
 class RootCache(eqx.Module):
@@ -173,13 +175,15 @@ def polish_roots(
 ) -> FrameData:
     """Move the roots of some frames, or of all, to where the field has them now.
 
-    By Newton steps with the table's Jacobian. The residual is the field's own: a root that has
-    vanished is not valid any more, and comes back if it is found again.
+    By Newton steps with the table's Jacobian. The residual is the field's own, after the last step
+    by the change on the table: a root that has vanished is not valid any more, and the first of a
+    row comes back if it is found again.
     """
     cache = data.roots
     assert cache is not None
     parts = lambda c: (c.first, c.valid, c.others, c.others_valid)  # noqa: E731
-    stored = (data.samples.x_d, data.transforms, cache.found, *parts(cache))
+    counts = cache.found, cache.several
+    stored = (data.samples.x_d, data.transforms, counts, *parts(cache))
     if rows is None or len(rows) == data.num_frames:
         moved = _polish(skinning, table, stored, steps)
     else:
@@ -195,24 +199,49 @@ def _polish(
     field: AbstractSkinningField, table: TabulatedSkinning, stored: tuple, steps: int
 ) -> tuple[Array, Array, Array, Array]:
     def one_frame(frame: tuple) -> tuple:
-        x_d, transforms, found, first, _, others, others_valid = frame
+        x_d, transforms, (found, several), first, _, others, others_valid = frame
         grid = pose_grid(table, transforms)
 
         def move(x_c: Array, x_d: Array) -> tuple[Array, Array]:
             return move_roots(
                 field, grid, x_c, x_d, transforms, steps=steps, atol=POLISH_TOLERANCE,
-                max_step=POLISH_LIMIT,
+                max_step=POLISH_LIMIT, estimate=True,
             )  # fmt: skip
 
-        first, ok = move(first, x_d)
-        ok = ok & (jnp.arange(len(ok)) < found)  # the last rows never had a root
-        flat = others.reshape(-1, 3)
-        targets = jnp.repeat(x_d[: others.shape[0]], others.shape[1], axis=0)
-        moved, others_ok = move(flat, targets)
+        first, ok = _by_blocks(move, first, x_d, found)
+        width, each = others.shape[:2]
+        targets = jnp.repeat(x_d[:width], each, axis=0)
+        moved, others_ok = _by_blocks(move, others.reshape(-1, 3), targets, several * each)
         others_ok = others_ok.reshape(others_valid.shape) & others_valid
         return first, ok, moved.reshape(others.shape), others_ok
 
     return jax.lax.map(one_frame, stored)
+
+
+def _by_blocks(
+    move: Callable[[Array, Array], tuple[Array, Array]],
+    x_c: Float[Array, "n 3"],
+    x_d: Float[Array, "n 3"],
+    count: Int[Array, ""],
+) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
+    """Move the first `count` points, which is all that have a root, and call the rest no roots.
+
+    In blocks, so that what is left out costs nothing.
+    """
+    number = -(-len(x_c) // _BLOCK)
+    size = -(-len(x_c) // max(number, 1))
+    room = ((0, number * size - len(x_c)), (0, 0))
+    targets = jnp.pad(x_d, room).reshape(number, size, 3)
+
+    def body(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        moved, ok = move(state[0][k], targets[k])
+        return state[0].at[k].set(moved), state[1].at[k].set(ok)
+
+    start = jnp.pad(x_c, room).reshape(number, size, 3), jnp.zeros((number, size), bool)
+    blocks = (count + size - 1) // max(size, 1)
+    moved, ok = jax.lax.fori_loop(0, blocks, body, start)
+    moved, ok = moved.reshape(-1, 3)[: len(x_c)], ok.reshape(-1)[: len(x_c)]
+    return moved, ok & (jnp.arange(len(ok)) < count)
 
 
 def replace_frames(data: FrameData, new: FrameData, rows: Int[np.ndarray, " r"]) -> FrameData:

@@ -42,11 +42,33 @@ OWN_TERMS = ("loss", "gradient", "occupancy", "bone", "joint", "surface", "found
 """Names of the terms and of the log, which user-defined terms cannot take."""
 
 
+class DrawnPoints(NamedTuple):
+    """Points of B frames, M each, with the roots known for each.
+
+    - `x_d`: posed, metres; `part`: labels; `distance`: metres, positive inside.
+    - `root`: one canonical root a point, metres; `valid`: whether it still is one.
+    - `others`: further roots of the first Q points, with `others_valid`. Q may be 0.
+    - `transforms`, `params`: of the frames.
+    """
+
+    x_d: Float[Array, "B M 3"]
+    root: Float[Array, "B M 3"]
+    part: Int[Array, "B M"]
+    distance: Float[Array, "B M"]
+    valid: Bool[Array, "B M"]
+    others: Float[Array, "B Q K 3"]
+    others_valid: Bool[Array, "B Q K"]
+    transforms: Float[Array, "B J 4 4"]
+    params: BodyParams
+
+
 class PointBatch(NamedTuple):
     """Points of B frames, M each, with the root that was chosen for each point.
 
     - `x_d`: posed, `x_c`: canonical, metres; `part`: labels; `distance`: metres, positive inside.
     - `found`: whether the point has a root; without one, `x_c` is meaningless but finite.
+    - `level`: of the geometry at `x_c`; `regular`: whether the root has derivatives.
+    - `bone_level`: at points on the canonical bones, if the stage draws them.
     - `transforms`, `params`: of the frames.
     """
 
@@ -55,16 +77,19 @@ class PointBatch(NamedTuple):
     part: Int[Array, "B M"]
     distance: Float[Array, "B M"]
     found: Bool[Array, "B M"]
+    level: Float[Array, "B M"]
+    regular: Bool[Array, "B M"]
+    bone_level: Float[Array, " n"] | None
     transforms: Float[Array, "B J 4 4"]
     params: BodyParams
 
 
-_POINT_LEAVES = ("x_d", "x_c", "part", "distance", "found")
+_POINT_LEAVES = ("x_d", "root", "part", "distance", "valid")
 
 
-def _specs(batch: PointBatch) -> PointBatch:
-    """How the leaves of a batch are divided among devices."""
-    by_frame = jax.tree.map(lambda _: BY_FRAME, batch)
+def _specs(drawn: DrawnPoints) -> DrawnPoints:
+    """How the leaves of a draw are divided among devices."""
+    by_frame = jax.tree.map(lambda _: BY_FRAME, drawn)
     return by_frame._replace(**dict.fromkeys(_POINT_LEAVES, BY_POINT))
 
 
@@ -85,7 +110,7 @@ class RowDraw(NamedTuple):
 
 
 class AbstractDraw(eqx.Module):
-    """Draws points of random frames, with the root that counts for each point.
+    """Draws points of random frames, with their roots.
 
     `lost_is_outside`: whether a point without a root counts as outside in validation; otherwise
     its root stays where it was seen last.
@@ -94,19 +119,19 @@ class AbstractDraw(eqx.Module):
     rows: eqx.AbstractVar[RowDraw]
     lost_is_outside: eqx.AbstractClassVar[bool]
 
-    def __call__(self, model: AvatarModel, data: FrameData, key: PRNGKeyArray) -> PointBatch:
+    def __call__(self, model: AvatarModel, data: FrameData, key: PRNGKeyArray) -> DrawnPoints:
         frame_key, key = jax.random.split(key)
         return self.of_frames(model, data, self.rows.chosen(data, frame_key), key)
 
     @abc.abstractmethod
     def of_frames(
         self, model: AvatarModel, data: FrameData, chosen: Int[Array, " B"], key: PRNGKeyArray
-    ) -> PointBatch:
+    ) -> DrawnPoints:
         """Random points of these frames."""
 
 
 class DrawCached(AbstractDraw):
-    """Draws points whose roots are cached, and of several roots takes the most inside one."""
+    """Draws points whose roots are cached."""
 
     rows: RowDraw = eqx.field(static=True)
     devices: Devices = eqx.field(static=True, default=ONE_DEVICE)
@@ -114,7 +139,7 @@ class DrawCached(AbstractDraw):
 
     def of_frames(
         self, model: AvatarModel, data: FrameData, chosen: Int[Array, " B"], key: PRNGKeyArray
-    ) -> PointBatch:
+    ) -> DrawnPoints:
         """Random points of these frames, all from rows that had a root when searched."""
         cache = data.roots
         assert cache is not None
@@ -130,21 +155,23 @@ class DrawCached(AbstractDraw):
             ],
             axis=1,
         )
-        batch = _take(data, chosen, rows, cache.first, cache.valid)
-        others, others_valid = (
-            leaf[chosen[:, None], rows[:, : self.rows.several]]
-            for leaf in (cache.others, cache.others_valid)
+        drawn = _take(data, chosen, rows)
+        at = chosen[:, None], rows
+        several = chosen[:, None], rows[:, : self.rows.several]
+        drawn = drawn._replace(
+            root=cache.first[at],
+            valid=cache.valid[at],
+            others=cache.others[several],
+            others_valid=cache.others_valid[several],
         )
-        batch = self.devices.divide(batch, _specs(batch))
-        conditions = jax.vmap(model.geometry.condition)(batch.params)
-        x_c, found = jax.vmap(_best_cached, in_axes=(None, 0, 0, 0, 0, 0))(
-            model, batch.x_c, batch.found, others, others_valid, conditions
-        )
-        return batch._replace(x_c=x_c, found=found)
+        return self.devices.divide(drawn, _specs(drawn))
 
 
 class DrawAndSearch(AbstractDraw):
-    """Draws points and searches their roots on the model itself (X-Avatar, section 3.3)."""
+    """Draws points, searches their roots on the model itself and takes the most inside one.
+
+    Source: X-Avatar, section 3.3.
+    """
 
     starts: StartTable
     rows: RowDraw = eqx.field(static=True)
@@ -156,22 +183,22 @@ class DrawAndSearch(AbstractDraw):
 
     def of_frames(
         self, model: AvatarModel, data: FrameData, chosen: Int[Array, " B"], key: PRNGKeyArray
-    ) -> PointBatch:
+    ) -> DrawnPoints:
         """Random points of these frames."""
         shape = (len(chosen), self.rows.points)
         rows = jax.random.randint(key, shape, 0, data.samples.x_d.shape[1])
-        batch = _take(data, chosen, rows)
-        batch = self.devices.divide(batch, _specs(batch))
+        drawn = _take(data, chosen, rows)
+        drawn = self.devices.divide(drawn, _specs(drawn))
         x_c, valid = self.devices.apart(
-            self._search, (model.skinning, data.guide), batch, _specs(batch)
+            self._search, (model.skinning, data.guide), drawn, _specs(drawn)
         )
-        conditions = jax.vmap(model.geometry.condition)(batch.params)
+        conditions = jax.vmap(model.geometry.condition)(drawn.params)
         best = jax.vmap(best_root, in_axes=(None, 0, 0, 0))
-        x_c, found = best(model.geometry, x_c, valid, conditions)
-        return batch._replace(x_c=x_c, found=found)
+        root, valid = best(model.geometry, x_c, valid, conditions)
+        return drawn._replace(root=root, valid=valid)
 
     def _search(
-        self, fields: tuple[AbstractSkinningField, TabulatedSkinning | None], batch: PointBatch
+        self, fields: tuple[AbstractSkinningField, TabulatedSkinning | None], drawn: DrawnPoints
     ) -> tuple[Float[Array, "B M K 3"], Bool[Array, "B M K"]]:
         skinning, guide = jax.lax.stop_gradient(fields)
         solver = Broyden(atol=self.atol, divergence=1.0)
@@ -189,25 +216,22 @@ class DrawAndSearch(AbstractDraw):
             return found.x_c, found.valid
 
         # Frame by frame: the loops inside end when that frame's points do.
-        return jax.lax.map(one_frame, (batch.x_d, batch.part, batch.transforms))
+        return jax.lax.map(one_frame, (drawn.x_d, drawn.part, drawn.transforms))
 
 
-def _take(
-    data: FrameData, chosen: Int[Array, " B"], rows: Int[Array, "B M"], *root: Array
-) -> PointBatch:
-    def take(leaf: Array) -> Array:
-        return leaf[chosen[:, None], rows]
-
-    x_d = take(data.samples.x_d)  # pyright: ignore[reportArgumentType]
-    x_c, found = map(take, root) if root else (x_d, jnp.ones(rows.shape, bool))
-    return PointBatch(
-        x_d,
-        x_c,
-        take(data.samples.part).astype(jnp.int32),  # pyright: ignore[reportArgumentType]
-        take(data.samples.distance),  # pyright: ignore[reportArgumentType]
-        found,
-        data.transforms[chosen],
-        jax.tree.map(lambda leaf: leaf[chosen], data.params),
+def _take(data: FrameData, chosen: Int[Array, " B"], rows: Int[Array, "B M"]) -> DrawnPoints:
+    """The samples of some rows, with nothing known of their roots."""
+    x_d, part, distance = (leaf[chosen[:, None], rows] for leaf in data.samples)
+    return DrawnPoints(
+        x_d=x_d,
+        root=x_d,
+        part=part.astype(jnp.int32),
+        distance=distance,
+        valid=jnp.zeros(rows.shape, bool),
+        others=jnp.zeros((len(chosen), 0, 1, 3), x_d.dtype),
+        others_valid=jnp.zeros((len(chosen), 0, 1), bool),
+        transforms=data.transforms[chosen],
+        params=jax.tree.map(lambda leaf: leaf[chosen], data.params),
     )
 
 
@@ -220,76 +244,124 @@ def _uniform_index(
     return low[:, None] + jnp.minimum((u * span).astype(jnp.int32), span - 1)
 
 
-def _best_cached(
-    model: AvatarModel,
-    first: Float[Array, "M 3"],
-    valid: Bool[Array, " M"],
-    others: Float[Array, "Q K 3"],
-    others_valid: Bool[Array, "Q K"],
-    condition: Any,
-) -> tuple[Float[Array, "M 3"], Bool[Array, " M"]]:
-    """The best of the cached roots, evaluating the field only at points that have several."""
-    rows = others.shape[0]
-    if not rows or not others.shape[1]:
-        return first, valid
-    roots = jnp.concatenate([first[:rows, None], others], axis=1)
-    usable = jnp.concatenate([valid[:rows, None], others_valid], axis=1)
-    best, found = best_root(model.geometry, roots, usable, condition)
-    best = jnp.where(found[:, None], best, first[:rows])
-    return jnp.concatenate([best, first[rows:]]), jnp.concatenate([found, valid[rows:]])
+class LevelsAtRoots(eqx.Module):
+    """The levels at the roots and at points on the bones: what the terms of a stage share.
+
+    Of several roots, the most inside one counts (X-Avatar, section 3.3).
+
+    - `through_root`: gives levels the implicit derivative with respect to the skinning field
+      (X-Avatar, eq. 3 and 9).
+    - `joints`: of the canonical bones on which points are drawn, shared out among the conditions
+      of the batch's frames; None for no such points.
+    """
+
+    through_root: bool = eqx.field(static=True)
+    tree: KinematicTree = eqx.field(static=True)
+    joints: Float[Array, "J 3"] | None = None
+
+    def __call__(self, model: AvatarModel, drawn: DrawnPoints, key: PRNGKeyArray) -> PointBatch:
+        if self.through_root:  # the implicit derivative costs more than to choose first
+            drawn = _with_best_root(model, drawn)
+        (frames, points), (several, more) = drawn.x_d.shape[:2], drawn.others.shape[1:3]
+        roots = jnp.concatenate([drawn.root, drawn.others.reshape(frames, -1, 3)], axis=1)
+        targets = jnp.repeat(drawn.x_d[:, :several], more, axis=1)
+        targets = jnp.concatenate([drawn.x_d, targets], axis=1)
+        on_bones = jnp.zeros((0, 3), roots.dtype)
+        if self.joints is not None:
+            on_bones = bone_points(self.tree, self.joints, key)
+        share = -(-len(on_bones) // frames)
+        padded = jnp.resize(on_bones, (share * frames, 3)).reshape(share, frames, 3)
+        x_c, level, regular, bone_level = jax.vmap(self._one_frame, in_axes=(None, 0, 0, 1, 0, 0))(
+            model, roots, targets, padded, drawn.transforms, drawn.params
+        )
+
+        def by_root(leaf: Array, fill: float) -> Array:
+            """Every root of a point; a value for those that only the first points have."""
+            rest = ((0, 0), (0, points - several), (0, 0), *((0, 0),) * (leaf.ndim - 2))
+            further = leaf[:, points:].reshape(frames, several, more, *leaf.shape[2:])
+            return jnp.concatenate(
+                [leaf[:, :points, None], jnp.pad(further, rest, constant_values=fill)], axis=2
+            )
+
+        valid = jnp.concatenate([drawn.valid, drawn.others_valid.reshape(frames, -1)], axis=1)
+        known = jnp.where(valid, jax.lax.stop_gradient(level), -jnp.inf)
+        best = jnp.argmax(by_root(known, -jnp.inf), axis=2, keepdims=True)
+
+        def chosen(leaf: Array) -> Array:
+            index = best.reshape(*best.shape, *(1,) * (leaf.ndim - 2))
+            return jnp.take_along_axis(by_root(leaf, 0), index, axis=2)[:, :, 0]
+
+        return PointBatch(
+            x_d=drawn.x_d,
+            x_c=chosen(x_c),
+            part=drawn.part,
+            distance=drawn.distance,
+            found=chosen(valid),
+            level=chosen(level),
+            regular=chosen(regular),
+            bone_level=bone_level.T.reshape(-1)[: len(on_bones)],
+            transforms=drawn.transforms,
+            params=drawn.params,
+        )
+
+    def _one_frame(
+        self,
+        model: AvatarModel,
+        x_c: Float[Array, "P 3"],
+        x_d: Float[Array, "P 3"],
+        on_bones: Float[Array, "S 3"],
+        transforms: Float[Array, "J 4 4"],
+        params: BodyParams,
+    ) -> tuple[Array, Array, Array, Array]:
+        regular = jnp.ones(len(x_c), bool)
+        if self.through_root:
+            refine = jax.vmap(implicit_root, in_axes=(0, 0, None, None))
+            x_c, _, regular = refine(x_c, x_d, model.skinning, transforms)
+        condition = model.geometry.condition(params)
+        # One call for all points: what a condition costs is paid once, and compiled once.
+        places = jnp.concatenate([x_c, on_bones])
+        level = jax.vmap(lambda x: model.geometry(x, condition).level)(places)
+        return x_c, level[: len(x_c)], regular, level[len(x_c) :]
+
+
+def _with_best_root(model: AvatarModel, drawn: DrawnPoints) -> DrawnPoints:
+    """The same points with the best of their roots alone, or with the first if none is valid."""
+    rows = drawn.others.shape[1]
+    if not rows or not drawn.others.shape[2]:
+        return drawn
+    roots = jnp.concatenate([drawn.root[:, :rows, None], drawn.others], axis=2)
+    usable = jnp.concatenate([drawn.valid[:, :rows, None], drawn.others_valid], axis=2)
+    conditions = jax.vmap(model.geometry.condition)(drawn.params)
+    choose = jax.vmap(best_root, in_axes=(None, 0, 0, 0))
+    best, found = choose(model.geometry, roots, usable, conditions)
+    best = jnp.where(found[..., None], best, drawn.root[:, :rows])
+    return drawn._replace(
+        root=drawn.root.at[:, :rows].set(best),
+        valid=drawn.valid.at[:, :rows].set(found),
+        others=drawn.others[:, :0],
+        others_valid=drawn.others_valid[:, :0],
+    )
 
 
 class LevelTerm(eqx.Module):
-    """The loss of the level at the chosen roots. With `through_root`, it also has the implicit
-    derivative with respect to the skinning field (X-Avatar, eq. 3 and 9)."""
-
-    through_root: bool = eqx.field(static=True)
+    """The loss of the level at the chosen roots that are regular."""
 
     def __call__(
         self, model: AvatarModel, batch: PointBatch, key: PRNGKeyArray
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        level, used = _levels(model, batch, self.through_root)
-        used = used & batch.found
-        loss = jnp.where(used, model.link.loss(level, batch.distance), 0.0)
+        used = batch.regular & batch.found
+        loss = jnp.where(used, model.link.loss(batch.level, batch.distance), 0.0)
         return loss.sum(), used.sum()
 
 
-def _levels(
-    model: AvatarModel, batch: PointBatch, through_root: bool
-) -> tuple[Float[Array, "B M"], Bool[Array, "B M"]]:
-    """Levels at the roots, and where the map is regular: elsewhere a root has no derivative."""
-
-    def one(x_c: Array, x_d: Array, transforms: Array, condition: Any) -> tuple[Array, Array]:
-        regular = jnp.ones((), bool)
-        if through_root:
-            x_c, _, regular = implicit_root(x_c, x_d, model.skinning, transforms)
-        return model.geometry(x_c, condition).level, regular
-
-    conditions = jax.vmap(model.geometry.condition)(batch.params)
-    over_points = jax.vmap(one, in_axes=(0, 0, None, None))
-    return jax.vmap(over_points)(batch.x_c, batch.x_d, batch.transforms, conditions)
-
-
 class BoneTerm(eqx.Module):
-    """Points on the canonical bones are inside (X-Avatar, eq. 10).
-
-    They are shared out among the conditions of the batch's frames.
-    """
-
-    joints: Float[Array, "J 3"]
-    tree: KinematicTree = eqx.field(static=True)
+    """Points on the canonical bones are inside (X-Avatar, eq. 10)."""
 
     def __call__(
         self, model: AvatarModel, batch: PointBatch, key: PRNGKeyArray
     ) -> Float[Array, ""]:
-        inside = bone_points(self.tree, self.joints, key)
-        frames = batch.x_d.shape[0]
-        share = -(-len(inside) // frames)
-        padded = jnp.resize(inside, (share * frames, 3)).reshape(share, frames, 3)
-        conditions = jax.vmap(model.geometry.condition)(batch.params)
-        over_frames = jax.vmap(lambda x, c: model.geometry(x, c).level)
-        levels = jax.vmap(over_frames, in_axes=(0, None))(padded, conditions)
-        return model.link.inside_loss(levels.reshape(-1)[: len(inside)]).mean()
+        assert batch.bone_level is not None
+        return model.link.inside_loss(batch.bone_level).mean()
 
 
 class JointTerm(eqx.Module):
@@ -421,15 +493,19 @@ def training_stages(
     betas = jnp.asarray(betas)
     joints = jnp.asarray(canonical_joints(body, betas), jnp.float32)
     on_weights = weight_terms(body, betas, losses) if learn_skinning else {}
-    bone = (losses.bone, BoneTerm(joints, body.tree))
     schedule = FALLING if optimiser.schedule == "cosine" else CONSTANT
 
-    def stage(name: str, learns: tuple[str, ...], draw: Any, terms: Terms, **more: Any) -> Stage:
+    def stage(
+        name: str, learns: tuple[str, ...], draw: AbstractDraw, terms: Terms, *,
+        through_root: bool, **more: Any,
+    ) -> Stage:  # fmt: skip
+        forward = LevelsAtRoots(through_root, body.tree, joints if "bone" in terms else None)
         return Stage(
-            name, draw, {**terms, **extra}, optimiser_of(optimiser), LearnsParts(learns), schedule,
-            **more,
+            name, draw, {"occupancy": (1.0, LevelTerm()), **terms, **extra},
+            optimiser_of(optimiser), LearnsParts(learns), schedule, forward=forward, **more,
         )  # fmt: skip
 
+    bone = {"bone": (losses.bone, BoneTerm())}
     if not search.cached:
         draw = DrawAndSearch(
             starts=start_table(body, search.starts),
@@ -439,20 +515,25 @@ def training_stages(
             max_steps=search.max_steps,
             devices=devices,
         )
-        level = LevelTerm(through_root=learn_skinning)
-        terms = {"occupancy": (1.0, level), "bone": bone, **on_weights, "found": (0.0, FoundTerm())}
+        terms = {**bone, **on_weights, "found": (0.0, FoundTerm())}
         learns = ("skinning", "geometry") if learn_skinning else ("geometry",)
-        return (stage("fields", learns, draw, terms),)
+        return (stage("fields", learns, draw, terms, through_root=learn_skinning),)
     several = rows_with_several(data, points)
     draw = DrawCached(RowDraw(frames, points, several, held), devices)
-    terms = {"occupancy": (1.0, LevelTerm(through_root=False)), "bone": bone}
-    stages = [stage("geometry", ("geometry",), draw, terms)]
+    stages = [stage("geometry", ("geometry",), draw, bone, through_root=False)]
     if learn_skinning:
         count = min(skinning_points, points)
         draw = DrawCached(RowDraw(frames, count, min(several, count), held), devices)
-        terms = {"occupancy": (1.0, LevelTerm(through_root=True)), **on_weights}
         stages.append(
-            stage("skinning", ("skinning",), draw, terms, every=skinning_every, prefix="skinning_")
+            stage(
+                "skinning",
+                ("skinning",),
+                draw,
+                on_weights,
+                through_root=True,
+                every=skinning_every,
+                prefix="skinning_",
+            )
         )
     return tuple(stages)
 
@@ -472,13 +553,15 @@ class ValidationLoss(eqx.Module):
     """
 
     draw: AbstractDraw
+    forward: LevelsAtRoots
     link: AbstractLink
 
     def __call__(self, model: AvatarModel, data: FrameData) -> Float[Array, ""]:
         held = self.draw.rows.held
         chosen = jnp.arange(data.num_frames - held, data.num_frames)
-        batch = self.draw.of_frames(model, data, chosen, jax.random.key(0x5EED))
-        level, _ = _levels(model, batch, through_root=True)
+        key = jax.random.key(0x5EED)
+        batch = self.forward(model, self.draw.of_frames(model, data, chosen, key), key)
+        level = batch.level
         if self.draw.lost_is_outside:
             level = jnp.where(batch.found, level, self.link.outside)
         return self.link.loss(level, batch.distance).mean()
@@ -489,7 +572,8 @@ def validation_loss(
 ) -> Callable[[Any, Any], Float[Array, ""]]:
     """The validation loss of a run with these stages."""
     draw: Any = stages[0].draw
+    forward: Any = stages[-1].forward  # through the root, where the skinning field is learned
     points = min(points, data.samples.x_d.shape[1])
     several = rows_with_several(data, points) if data.roots is not None else 0
     rows = RowDraw(held, points, several, held)
-    return ValidationLoss(replace(draw, rows=rows), link)
+    return ValidationLoss(replace(draw, rows=rows), replace(forward, joints=None), link)

@@ -31,7 +31,7 @@ from ...sampling import signed_distance
 from .config import FitConfig, LossConfig, OptimiserConfig
 from .stages import LearnsParts, optimiser_of, weight_terms
 
-_REVISION = 4  # raised when the fit below changes: it is part of the cache's key
+_REVISION = 5  # raised when the fit below changes: it is part of the cache's key
 _POINTS = 400_000
 _SIGMA = (0.003, 0.01, 0.03)  # metres, of the points around the mean shape
 _SURFACE_POINTS = 256  # a step of the weights: more teach a network less in the same time
@@ -86,20 +86,20 @@ def fit_mean_shape(
 
     Geometry is always fitted; skinning, unless it has the template's weights already or is to
     start at random. The person's betas, correctives and frames play no part. `model` is what
-    `build_model(spec, body)` gives for `seed`, possibly with other fields in it.
+    `mean_shape_model` gives for `seed`, possibly with other fields in it.
     """
     fits_skinning = not spec.skinning.knows_template and spec.skinning.start == "template"
     learns = LearnsParts(("skinning", "geometry") if fits_skinning else ("geometry",))
+    arrays = eqx.filter(model, learns(model))
     options = (optimiser.learning_rate, optimiser.clip, optimiser.epsilon)
     key = json.dumps(
         [
             __version__, _REVISION, body.source.checksum, body.num_expression, spec.to_dict(),
-            steps, options, seed, str(eqx.filter_eval_shape(lambda: model)),
+            steps, options, seed, str(eqx.filter_eval_shape(lambda: arrays)),
         ]
     )  # fmt: skip
     name = hashlib.sha256(key.encode()).hexdigest()[:16]
     path = cache_path(cache) / f"mean-shape-{name}.npz"
-    arrays = eqx.filter(model, learns(model))
     kept = _read_cached(path, arrays)
     if kept is not None:
         return eqx.combine(kept, model)
