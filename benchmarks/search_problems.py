@@ -33,7 +33,7 @@ SHARES = tuple(
     (PARTS.members(name), share / 6)
     for name, share in (("body", 3), ("face", 1), ("left_hand", 1), ("right_hand", 1))
 )
-QUICK_PREFIT, FULL_PREFIT = 1000, 4000
+QUICK_PREFIT, FULL_PREFIT = 150, 4000
 
 
 class Problem(NamedTuple):

@@ -228,7 +228,6 @@ def move_roots(
     steps: int = 2,
     atol: float = 1e-4,
     max_step: float = 0.02,
-    estimate: bool = False,
 ) -> tuple[Float[Array, "*points 3"], Bool[Array, "*points"]]:
     """Move roots that were found for an earlier or a nearby field to the roots of this one.
 
@@ -238,9 +237,7 @@ def move_roots(
     than `max_step` metres would lead to another root and is not taken.
 
     Returns the moved points and whether each is a root: its residual on the field is below `atol`
-    metres, and the field covers it. With `estimate`, which needs a guide, that residual is not
-    queried but the field's before the last step plus what the step changes on the guide, at half
-    the cost of a single step. Not differentiable; see `implicit_root`.
+    metres, and the field covers it. Not differentiable; see `implicit_root`.
     """
     field, guide, x_d, transforms = jax.lax.stop_gradient((field, guide, x_d, transforms))
 
@@ -248,23 +245,17 @@ def move_roots(
         return skin_points(x, field(x), transforms) - target
 
     def move(x: Array, target: Array) -> tuple[Array, Array]:
-        off = known = jnp.zeros_like(x)
         for _ in range(steps):
             if guide is None:
                 posed, jacobian, _ = skin_with_jacobian(field, x, transforms)
                 off = posed - target
             else:
-                off = residual(x, target)
-                known, jacobian = guide(x)
+                off, jacobian = residual(x, target), guide(x)[1]
             step = solve_3x3(jacobian, off)
             # Also false for a step that is not finite.
             x = jnp.where(jnp.sum(step**2) < max_step**2, x - step, x)
-        if estimate and guide is not None:
-            left = off + guide(x)[0] - known
-        else:
-            left = residual(x, target)
         # Also false for a residual that is not finite.
-        return x, (jnp.sum(left**2) < atol**2) & field.covers(x)
+        return x, (jnp.sum(residual(x, target) ** 2) < atol**2) & field.covers(x)
 
     batch = x_c.shape[:-1]
     moved, valid = jax.vmap(move)(jax.lax.stop_gradient(x_c).reshape(-1, 3), x_d.reshape(-1, 3))

@@ -51,6 +51,12 @@ class AbstractGeometryField(eqx.Module):
         """
 
     @abc.abstractmethod
+    def carried_from(
+        self, x_c: Float[Array, "3"], condition: Any
+    ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        """The neutral point that `carry` takes to `x_c`, and how far from `x_c` it ends, metres."""
+
+    @abc.abstractmethod
     def carried_value(self, x: Float[Array, "3"], condition: Any) -> GeometryValue:
         """The field at `carry(x, condition)`, without the search for what is carried there."""
 
@@ -95,6 +101,11 @@ class AbstractPlainGeometry(AbstractGeometryField):
 
     def carry(self, x_c: Float[Array, "3"], condition: Any) -> Float[Array, "3"]:
         return x_c
+
+    def carried_from(
+        self, x_c: Float[Array, "3"], condition: Any
+    ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        return x_c, jnp.zeros((), x_c.dtype)
 
     def carried_value(self, x: Float[Array, "3"], condition: Any) -> GeometryValue:
         return self(x, condition)

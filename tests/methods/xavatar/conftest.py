@@ -13,5 +13,5 @@ def case(toy_body):
     frames, config = posed_frames(toy_body, 3), tiny(xa.quick())
     model = fresh_model(toy_body, config)
     data = labelled(toy_body, frames, config)
-    table, data = with_roots(toy_body, model.skinning, data, config)
+    table, data = with_roots(toy_body, model, data, config)
     return Case(toy_body, frames, config, model, table, data)

@@ -63,16 +63,17 @@ def labelled(body: xa.BodyModel, frames: xa.Frames, config: xa.FitConfig) -> Fra
 
 
 def with_roots(
-    body: xa.BodyModel, skinning: Any, data: FrameData, config: xa.FitConfig
+    body: xa.BodyModel, model: Any, data: FrameData, config: xa.FitConfig
 ) -> tuple[Any, FrameData]:
     """The tabulated field, and the data with roots on it."""
-    search = config.search
+    search, skinning = config.search, model.skinning
     betas = np.zeros(body.num_betas)
     table = tabulated(skinning, grids_for_search(skinning, body, betas, search.grid))
     starts = start_table(body, search.starts)
     return table, search_roots(
-        table, data, starts, keep=search.keep, atol=search.atol, max_steps=search.max_steps
-    )
+        model.geometry, table, data, starts,
+        keep=search.keep, atol=search.atol, max_steps=search.max_steps,
+    )  # fmt: skip
 
 
 def fresh_model(body: xa.BodyModel, config: xa.FitConfig) -> Any:

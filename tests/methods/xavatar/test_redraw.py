@@ -21,7 +21,7 @@ def rounds(case):
     grids = grids_for_search(skinning, case.body, np.zeros(10), case.config.search.grid)
     # Points of another seed, which the rounds share out.
     config = replace(case.config, points=replace(case.config.points, sigma=(0.004, 0.013)))
-    _, other = with_roots(case.body, skinning, labelled(case.body, case.frames, config), config)
+    _, other = with_roots(case.body, case.model, labelled(case.body, case.frames, config), config)
 
     def make(rows, number):
         asked.append((rows.tolist(), number))

@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from xavatar_jax.correspondence import start_table
+from xavatar_jax.fields import build_model
 from xavatar_jax.methods.xavatar.roots import (
     POLISH_TOLERANCE,
     polish_roots,
     replace_frames,
     rows_in_turn,
+    search_roots,
 )
 
 
@@ -56,7 +60,7 @@ def test_rows_with_several_roots_come_first_and_those_without_last(case):
 def polished(case, data, times=1):
     """Polished by one step at a time, which is one compiled program."""
     for _ in range(times):
-        data = polish_roots(case.model.skinning, case.table, data, steps=1)
+        data = polish_roots(case.model, case.table, data, steps=1)
     return data
 
 
@@ -72,6 +76,32 @@ def test_polished_roots_belong_to_the_field_itself(case):
     assert np.median(gap) <= np.median(gaps(skinning, data, 0, rows))
 
 
+def test_neutral_points_are_carried_to_the_roots(case, rng):
+    """Under an expression that moves the head, after a search and after a polish."""
+    model = build_model(case.config.spec, case.body, key=jax.random.key(0), betas=np.zeros(10))
+    model = eqx.tree_at(lambda m: m.geometry.moves.table, model, replace_fn=lambda t: t + 0.002)
+    smiling = np.float32(0.5 * rng.normal(size=(3, 10)))
+    data = eqx.tree_at(lambda d: d.params.expression, case.data, jnp.asarray(smiling))
+    search = case.config.search
+    searched = search_roots(
+        model.geometry, case.table, data, start_table(case.body, search.starts),
+        keep=search.keep, atol=search.atol, max_steps=search.max_steps,
+    )  # fmt: skip
+    for found in (searched, polish_roots(model, case.table, searched, steps=1)):
+        for k in range(3):
+            roots = found.roots
+            condition = model.geometry.condition(jax.tree.map(lambda v, k=k: v[k], data.params))
+            carry = jax.jit(jax.vmap(lambda x, c=condition: model.geometry.carry(x, c)))
+            for name, valid in (("", roots.valid), ("others", roots.others_valid)):
+                root, neutral = (
+                    np.asarray(getattr(roots, n)[k])[np.asarray(valid[k])]
+                    for n in (name or "first", f"{name}_neutral".lstrip("_"))
+                )
+                np.testing.assert_allclose(carry(neutral), root, atol=3e-5)
+            moved = np.abs(np.asarray(roots.neutral[k] - roots.first[k])).max()
+            assert moved > 1e-4
+
+
 def test_a_root_that_has_vanished_is_dropped_and_may_come_back(case):
     """A point is moved away: the residual alone tells, and only its own row changes."""
     known = polished(case, case.data, 3)
@@ -80,7 +110,7 @@ def test_a_root_that_has_vanished_is_dropped_and_may_come_back(case):
     for metres in (0.015, 3.0):  # within what one step may do, and beyond
         moved = known.samples.x_d.at[1, row, 0].add(metres)
         away = eqx.tree_at(lambda d: d.samples.x_d, known, moved)
-        none = polish_roots(case.model.skinning, case.table, away, steps=0)
+        none = polish_roots(case.model, case.table, away, steps=0)
         changed = before != np.asarray(none.roots.valid)
         assert np.argwhere(changed).tolist() == [[1, row]]
     none = polished(case, away)  # no step of three metres
@@ -96,13 +126,13 @@ def test_rows_that_never_had_a_root_stay_without(case):
 
 def test_roots_are_polished_in_turn(case):
     """The frames of a round as in a polish of all of them, and no others; each has its turn."""
-    skinning, data = case.model.skinning, case.data
+    data = case.data
     every = polished(case, data)
     rounds = [rows_in_turn(number, 2, 3).tolist() for number in (1, 2, 3)]
     assert rounds == [[0, 1], [2, 0], [1, 2]]
     assert rows_in_turn(5, 9, 3).tolist() == [0, 1, 2]
-    some = polish_roots(skinning, case.table, data, steps=1, rows=np.array([2, 0]))
-    for name in ("first", "others"):
+    some = polish_roots(case.model, case.table, data, steps=1, rows=np.array([2, 0]))
+    for name in ("first", "neutral", "others", "others_neutral"):
         mixed, done, before = (np.asarray(getattr(p.roots, name)) for p in (some, every, data))
         np.testing.assert_allclose(mixed[[0, 2]], done[[0, 2]], atol=1e-7)
         np.testing.assert_array_equal(mixed[1], before[1])
@@ -120,6 +150,7 @@ def test_replaced_frames_keep_every_shape(case):
         roots = replace(
             jax.tree.map(lambda leaf: leaf[:1] if leaf.ndim else leaf, data.roots),
             others=data.roots.others[:1, rows], others_valid=data.roots.others_valid[:1, rows],
+            others_neutral=data.roots.others_neutral[:1, rows],
         )  # fmt: skip
         new = replace(data, samples=first[0], transforms=first[1], params=first[2], roots=roots)
         put = replace_frames(data, new, np.array([2]))

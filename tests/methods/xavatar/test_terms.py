@@ -108,7 +108,8 @@ def stored(x64, rng):
     first_valid = np.array([[True] * 5, [True, True, True, True, False]])
     distance = rng.normal(size=(2, 5)) * 0.005
     cache = RootCache(
-        first=jnp.asarray(left), valid=jnp.asarray(first_valid), others=jnp.asarray(others),
+        first=jnp.asarray(left), neutral=jnp.asarray(left), valid=jnp.asarray(first_valid),
+        others=jnp.asarray(others), others_neutral=jnp.asarray(others),
         others_valid=jnp.asarray(valid), found=jnp.asarray([5, 4]), several=jnp.asarray([3, 3]),
         share=jnp.asarray(6 / 9),
     )  # fmt: skip
@@ -160,7 +161,9 @@ def test_the_level_is_that_of_the_best_root_and_lost_points_count_for_nothing(st
     # Wherever a lost point stands, losses and slopes are the same.
     elsewhere = drawn._replace(
         root=jnp.where(drawn.valid[..., None], drawn.root, 7.0),
+        neutral=jnp.where(drawn.valid[..., None], drawn.neutral, 7.0),
         others=jnp.where(drawn.others_valid[..., None], drawn.others, -7.0),
+        others_neutral=jnp.where(drawn.others_valid[..., None], drawn.others, -7.0),
     )
 
     for through in (False, True):
@@ -177,9 +180,11 @@ def drawn_points(x_d, root, distance, bones, params):
     """Points with one root each."""
     frames, points = x_d.shape[:2]
     return DrawnPoints(
-        x_d=jnp.asarray(x_d), root=jnp.asarray(root), part=jnp.zeros((frames, points), int),
+        x_d=jnp.asarray(x_d), root=jnp.asarray(root), neutral=jnp.asarray(root),
+        part=jnp.zeros((frames, points), int),
         distance=jnp.asarray(distance), valid=jnp.ones((frames, points), bool),
-        others=jnp.zeros((frames, 0, 1, 3)), others_valid=jnp.zeros((frames, 0, 1), bool),
+        others=jnp.zeros((frames, 0, 1, 3)), others_neutral=jnp.zeros((frames, 0, 1, 3)),
+        others_valid=jnp.zeros((frames, 0, 1), bool),
         transforms=bones, params=params,
     )  # fmt: skip
 
@@ -365,7 +370,8 @@ def test_the_validation_loss_does_not_fall_as_roots_vanish(stored):
 def test_the_validation_loss_keeps_points_where_the_map_folds(stored):
     """They count with the root that was found, which is at the fold itself, x = 0."""
     data, _ = stored
-    cache = replace(data.roots, first=jnp.zeros((2, 5, 3)), others_valid=jnp.zeros((2, 3, 2), bool))
+    zero = jnp.zeros((2, 5, 3))
+    cache = replace(data.roots, first=zero, neutral=zero, others_valid=jnp.zeros((2, 3, 2), bool))
     deep = replace(
         data, roots=cache, samples=data.samples._replace(distance=jnp.full((2, 5), 0.02))
     )

@@ -255,8 +255,8 @@ class _Preparation:
         search = self.search
         if search.cached:
             return search_roots(
-                self.table, data, start_table(self.body, search.starts), keep=search.keep,
-                atol=search.atol, max_steps=search.max_steps, bar=bar,
+                self.start.geometry, self.table, data, start_table(self.body, search.starts),
+                keep=search.keep, atol=search.atol, max_steps=search.max_steps, bar=bar,
             )  # fmt: skip
         if search.guide_every:
             return self.with_guide(data, self.start)

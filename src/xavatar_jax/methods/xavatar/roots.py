@@ -13,7 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...body import BodyModel, BodyParams, bone_transforms
 from ...correspondence import ClosedFormNewton, StartTable, move_roots, search_grid
-from ...fields import AbstractSkinningField, TabulatedSkinning, pose_grid, tabulate
+from ...fields import (
+    AbstractGeometryField,
+    AvatarModel,
+    TabulatedSkinning,
+    pose_grid,
+    tabulate,
+)
 from ...sampling import VolumePoints
 
 POLISH_LIMIT, POLISH_TOLERANCE = 0.02, 5e-4
@@ -29,13 +35,17 @@ class RootCache(eqx.Module):
 
     - `first`: `(F, N, 3)` one root a row; `valid`: `(F, N)` whether it still is one.
     - `others`: `(F, Q, K, 3)` further roots of the first Q rows, with `others_valid`.
+    - `neutral`, `others_neutral`: the points of the neutral person that the frame's condition
+      carries to these roots (`AbstractGeometryField.carried_from`).
     - `found`, `several`: `(F,)` rows that had a root, and more than one, when searched.
     - `share`: of the rows with a root, those with several.
     """
 
     first: Float[Array, "F N 3"]
+    neutral: Float[Array, "F N 3"]
     valid: Bool[Array, "F N"]
     others: Float[Array, "F Q K 3"]
+    others_neutral: Float[Array, "F Q K 3"]
     others_valid: Bool[Array, "F Q K"]
     found: Int[Array, " F"]
     several: Int[Array, " F"]
@@ -89,6 +99,7 @@ tabulated = eqx.filter_jit(tabulate)
 
 
 def search_roots(
+    geometry: AbstractGeometryField,
     table: TabulatedSkinning,
     data: FrameData,
     starts: StartTable,
@@ -108,7 +119,8 @@ def search_roots(
         valid.append(np.asarray(ok))
         if bar is not None:
             bar.update(1)
-    return _sorted_by_roots(data, np.stack(x_c), np.stack(valid))
+    data = _sorted_by_roots(data, np.stack(x_c), np.stack(valid))
+    return _with_neutral(geometry, data)
 
 
 @eqx.filter_jit
@@ -128,6 +140,27 @@ def _search_frame(
     return found.x_c, found.valid
 
 
+@eqx.filter_jit
+def _with_neutral(geometry: AbstractGeometryField, data: FrameData) -> FrameData:
+    cache = data.roots
+    assert cache is not None
+
+    def one_frame(frame: tuple[BodyParams, Array, Array]) -> tuple[Array, Array]:
+        params, first, others = frame
+        flat = _neutral(geometry, jnp.concatenate([first, others.reshape(-1, 3)]), params)
+        return flat[: len(first)], flat[len(first) :].reshape(others.shape)
+
+    found = jax.lax.map(one_frame, (data.params, cache.first, cache.others))
+    return eqx.tree_at(lambda d: (d.roots.neutral, d.roots.others_neutral), data, found)
+
+
+def _neutral(
+    geometry: AbstractGeometryField, x_c: Float[Array, "n 3"], params: BodyParams
+) -> Float[Array, "n 3"]:
+    condition = geometry.condition(params)
+    return jax.vmap(lambda x: geometry.carried_from(x, condition)[0])(x_c)
+
+
 def _sorted_by_roots(
     data: FrameData, roots: Float[np.ndarray, "F N K 3"], valid: Bool[np.ndarray, "F N K"]
 ) -> FrameData:
@@ -145,9 +178,11 @@ def _sorted_by_roots(
 
     roots, valid = sort(roots), sort(valid)
     cache = RootCache(
-        first=jnp.asarray(roots[:, :, 0]),
+        first=(first := jnp.asarray(roots[:, :, 0])),
+        neutral=first,
         valid=jnp.asarray(valid[:, :, 0]),
-        others=jnp.asarray(roots[:, :width, 1:]),
+        others=(others := jnp.asarray(roots[:, :width, 1:])),
+        others_neutral=others,
         others_valid=jnp.asarray(valid[:, :width, 1:]),
         found=jnp.asarray((count > 0).sum(1), jnp.int32),
         several=jnp.asarray(several, jnp.int32),
@@ -166,7 +201,7 @@ def rows_in_turn(number: int, count: int, total: int) -> Int[np.ndarray, " r"]:
 
 
 def polish_roots(
-    skinning: AbstractSkinningField,
+    model: AvatarModel,
     table: TabulatedSkinning,
     data: FrameData,
     *,
@@ -175,20 +210,22 @@ def polish_roots(
 ) -> FrameData:
     """Move the roots of some frames, or of all, to where the field has them now.
 
-    By Newton steps with the table's Jacobian. The residual is the field's own, after the last step
-    by the change on the table: a root that has vanished is not valid any more, and the first of a
-    row comes back if it is found again.
+    By Newton steps with the table's Jacobian. The residual is the field's own: a root that has
+    vanished is not valid any more, and the first of a row comes back if it is found again.
     """
     cache = data.roots
     assert cache is not None
-    parts = lambda c: (c.first, c.valid, c.others, c.others_valid)  # noqa: E731
-    counts = cache.found, cache.several
-    stored = (data.samples.x_d, data.transforms, counts, *parts(cache))
+
+    def parts(c: RootCache) -> tuple[Array, ...]:
+        return c.first, c.neutral, c.valid, c.others, c.others_neutral, c.others_valid
+
+    of_frame = data.samples.x_d, data.transforms, data.params, cache.found, cache.several
+    stored = of_frame, parts(cache)
     if rows is None or len(rows) == data.num_frames:
-        moved = _polish(skinning, table, stored, steps)
+        moved = _polish(model, table, stored, steps)
     else:
         index = jnp.asarray(rows)
-        some = _polish(skinning, table, jax.tree.map(lambda v: v[index], stored), steps)
+        some = _polish(model, table, jax.tree.map(lambda v: v[index], stored), steps)
         old = parts(cache)
         moved = jax.tree.map(lambda whole, part: whole.at[index].set(part), old, some)
     return eqx.tree_at(lambda d: parts(d.roots), data, moved)
@@ -196,52 +233,59 @@ def polish_roots(
 
 @eqx.filter_jit
 def _polish(
-    field: AbstractSkinningField, table: TabulatedSkinning, stored: tuple, steps: int
-) -> tuple[Array, Array, Array, Array]:
+    model: AvatarModel, table: TabulatedSkinning, stored: tuple, steps: int
+) -> tuple[Array, ...]:
     def one_frame(frame: tuple) -> tuple:
-        x_d, transforms, (found, several), first, _, others, others_valid = frame
+        (x_d, transforms, params, found, several), roots = frame
+        first, neutral, _, others, others_neutral, others_valid = roots
         grid = pose_grid(table, transforms)
 
-        def move(x_c: Array, x_d: Array) -> tuple[Array, Array]:
-            return move_roots(
-                field, grid, x_c, x_d, transforms, steps=steps, atol=POLISH_TOLERANCE,
-                max_step=POLISH_LIMIT, estimate=True,
+        def move(x_c: Array, x_d: Array) -> tuple[Array, Array, Array]:
+            x_c, ok = move_roots(
+                model.skinning, grid, x_c, x_d, transforms, steps=steps, atol=POLISH_TOLERANCE,
+                max_step=POLISH_LIMIT,
             )  # fmt: skip
+            return x_c, _neutral(model.geometry, x_c, params), ok
 
-        first, ok = _by_blocks(move, first, x_d, found)
+        first, neutral, ok = _by_blocks(move, (first, neutral), x_d, found)
         width, each = others.shape[:2]
+        flat = others.reshape(-1, 3), others_neutral.reshape(-1, 3)
         targets = jnp.repeat(x_d[:width], each, axis=0)
-        moved, others_ok = _by_blocks(move, others.reshape(-1, 3), targets, several * each)
+        *moved, others_ok = _by_blocks(move, flat, targets, several * each)
+        others, others_neutral = (leaf.reshape(others.shape) for leaf in moved)
         others_ok = others_ok.reshape(others_valid.shape) & others_valid
-        return first, ok, moved.reshape(others.shape), others_ok
+        return first, neutral, ok, others, others_neutral, others_ok
 
     return jax.lax.map(one_frame, stored)
 
 
 def _by_blocks(
-    move: Callable[[Array, Array], tuple[Array, Array]],
-    x_c: Float[Array, "n 3"],
+    move: Callable[[Array, Array], tuple[Array, Array, Array]],
+    roots: tuple[Float[Array, "n 3"], Float[Array, "n 3"]],
     x_d: Float[Array, "n 3"],
     count: Int[Array, ""],
-) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Move the first `count` points, which is all that have a root, and call the rest no roots.
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
+    """Move the first `count` roots with their neutral points, and call the rest no roots.
 
     In blocks, so that what is left out costs nothing.
     """
-    number = -(-len(x_c) // _BLOCK)
-    size = -(-len(x_c) // max(number, 1))
-    room = ((0, number * size - len(x_c)), (0, 0))
-    targets = jnp.pad(x_d, room).reshape(number, size, 3)
+    total = len(x_d)
+    number = -(-total // _BLOCK)
+    size = -(-total // max(number, 1))
 
-    def body(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        moved, ok = move(state[0][k], targets[k])
-        return state[0].at[k].set(moved), state[1].at[k].set(ok)
+    def blocks(leaf: Array) -> Array:
+        return jnp.pad(leaf, ((0, number * size - total), (0, 0))).reshape(number, size, 3)
 
-    start = jnp.pad(x_c, room).reshape(number, size, 3), jnp.zeros((number, size), bool)
-    blocks = (count + size - 1) // max(size, 1)
-    moved, ok = jax.lax.fori_loop(0, blocks, body, start)
-    moved, ok = moved.reshape(-1, 3)[: len(x_c)], ok.reshape(-1)[: len(x_c)]
-    return moved, ok & (jnp.arange(len(ok)) < count)
+    targets = blocks(x_d)
+
+    def body(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        new = move(state[0][k], targets[k])
+        return jax.tree.map(lambda whole, part: whole.at[k].set(part), state, new)
+
+    start = *map(blocks, roots), jnp.zeros((number, size), bool)
+    x_c, neutral, ok = jax.lax.fori_loop(0, (count + size - 1) // max(size, 1), body, start)
+    ok = ok.reshape(-1)[:total] & (jnp.arange(total) < count)
+    return x_c.reshape(-1, 3)[:total], neutral.reshape(-1, 3)[:total], ok
 
 
 def replace_frames(data: FrameData, new: FrameData, rows: Int[np.ndarray, " r"]) -> FrameData:
@@ -259,14 +303,11 @@ def _padded_like(data: FrameData, new: FrameData) -> FrameData:
     width = data.roots.others.shape[1]
     short = max(width - new.roots.others.shape[1], 0)
     room = ((0, 0), (0, short), (0, 0))
-    return eqx.tree_at(
-        lambda d: (d.roots.others, d.roots.others_valid),
-        new,
-        (
-            jnp.pad(new.roots.others, (*room, (0, 0)))[:, :width],
-            jnp.pad(new.roots.others_valid, room)[:, :width],
-        ),
-    )
+    leaves = lambda d: (d.roots.others, d.roots.others_neutral, d.roots.others_valid)  # noqa: E731
+    padded = [
+        jnp.pad(leaf, (*room, *((0, 0),) * (leaf.ndim - 3)))[:, :width] for leaf in leaves(new)
+    ]
+    return eqx.tree_at(leaves, new, padded)
 
 
 @eqx.filter_jit
@@ -274,7 +315,8 @@ def _replace(data: FrameData, new: FrameData, rows: Int[Array, " r"]) -> FrameDa
     def changed(d: FrameData) -> tuple:
         c = d.roots
         cached = () if c is None else (
-            c.first, c.valid, c.others, c.others_valid, c.found, c.several
+            c.first, c.neutral, c.valid, c.others, c.others_neutral, c.others_valid,
+            c.found, c.several,
         )  # fmt: skip
         return (*d.samples, *cached)
 

@@ -48,15 +48,18 @@ class DrawnPoints(NamedTuple):
     - `x_d`: posed, metres; `part`: labels; `distance`: metres, positive inside.
     - `root`: one canonical root a point, metres; `valid`: whether it still is one.
     - `others`: further roots of the first Q points, with `others_valid`. Q may be 0.
+    - `neutral`, `others_neutral`: the points that the frame's condition carries to the roots.
     - `transforms`, `params`: of the frames.
     """
 
     x_d: Float[Array, "B M 3"]
     root: Float[Array, "B M 3"]
+    neutral: Float[Array, "B M 3"]
     part: Int[Array, "B M"]
     distance: Float[Array, "B M"]
     valid: Bool[Array, "B M"]
     others: Float[Array, "B Q K 3"]
+    others_neutral: Float[Array, "B Q K 3"]
     others_valid: Bool[Array, "B Q K"]
     transforms: Float[Array, "B J 4 4"]
     params: BodyParams
@@ -84,7 +87,7 @@ class PointBatch(NamedTuple):
     params: BodyParams
 
 
-_POINT_LEAVES = ("x_d", "root", "part", "distance", "valid")
+_POINT_LEAVES = ("x_d", "root", "neutral", "part", "distance", "valid")
 
 
 def _specs(drawn: DrawnPoints) -> DrawnPoints:
@@ -160,8 +163,10 @@ class DrawCached(AbstractDraw):
         several = chosen[:, None], rows[:, : self.rows.several]
         drawn = drawn._replace(
             root=cache.first[at],
+            neutral=cache.neutral[at],
             valid=cache.valid[at],
             others=cache.others[several],
+            others_neutral=cache.others_neutral[several],
             others_valid=cache.others_valid[several],
         )
         return self.devices.divide(drawn, _specs(drawn))
@@ -195,7 +200,9 @@ class DrawAndSearch(AbstractDraw):
         conditions = jax.vmap(model.geometry.condition)(drawn.params)
         best = jax.vmap(best_root, in_axes=(None, 0, 0, 0))
         root, valid = best(model.geometry, x_c, valid, conditions)
-        return drawn._replace(root=root, valid=valid)
+        inverse = jax.vmap(model.geometry.carried_from, in_axes=(0, None))
+        neutral, _ = jax.vmap(inverse)(root, conditions)
+        return drawn._replace(root=root, neutral=neutral, valid=valid)
 
     def _search(
         self, fields: tuple[AbstractSkinningField, TabulatedSkinning | None], drawn: DrawnPoints
@@ -225,10 +232,12 @@ def _take(data: FrameData, chosen: Int[Array, " B"], rows: Int[Array, "B M"]) ->
     return DrawnPoints(
         x_d=x_d,
         root=x_d,
+        neutral=x_d,
         part=part.astype(jnp.int32),
         distance=distance,
         valid=jnp.zeros(rows.shape, bool),
-        others=jnp.zeros((len(chosen), 0, 1, 3), x_d.dtype),
+        others=(none := jnp.zeros((len(chosen), 0, 1, 3), x_d.dtype)),
+        others_neutral=none,
         others_valid=jnp.zeros((len(chosen), 0, 1), bool),
         transforms=data.transforms[chosen],
         params=jax.tree.map(lambda leaf: leaf[chosen], data.params),
@@ -251,7 +260,7 @@ class LevelsAtRoots(eqx.Module):
 
     - `through_root`: gives levels the implicit derivative with respect to the skinning field
       (X-Avatar, eq. 3 and 9).
-    - `joints`: of the canonical bones on which points are drawn, shared out among the conditions
+    - `joints`: of the neutral bones on which points are drawn, shared out among the conditions
       of the batch's frames; None for no such points.
     """
 
@@ -260,87 +269,60 @@ class LevelsAtRoots(eqx.Module):
     joints: Float[Array, "J 3"] | None = None
 
     def __call__(self, model: AvatarModel, drawn: DrawnPoints, key: PRNGKeyArray) -> PointBatch:
-        if self.through_root:  # the implicit derivative costs more than to choose first
-            drawn = _with_best_root(model, drawn)
-        (frames, points), (several, more) = drawn.x_d.shape[:2], drawn.others.shape[1:3]
-        roots = jnp.concatenate([drawn.root, drawn.others.reshape(frames, -1, 3)], axis=1)
-        targets = jnp.repeat(drawn.x_d[:, :several], more, axis=1)
-        targets = jnp.concatenate([drawn.x_d, targets], axis=1)
-        on_bones = jnp.zeros((0, 3), roots.dtype)
+        frames = len(drawn.x_d)
+        on_bones = jnp.zeros((0, 3), drawn.x_d.dtype)
         if self.joints is not None:
             on_bones = bone_points(self.tree, self.joints, key)
         share = -(-len(on_bones) // frames)
         padded = jnp.resize(on_bones, (share * frames, 3)).reshape(share, frames, 3)
-        x_c, level, regular, bone_level = jax.vmap(self._one_frame, in_axes=(None, 0, 0, 1, 0, 0))(
-            model, roots, targets, padded, drawn.transforms, drawn.params
-        )
-
-        def by_root(leaf: Array, fill: float) -> Array:
-            """Every root of a point; a value for those that only the first points have."""
-            rest = ((0, 0), (0, points - several), (0, 0), *((0, 0),) * (leaf.ndim - 2))
-            further = leaf[:, points:].reshape(frames, several, more, *leaf.shape[2:])
-            return jnp.concatenate(
-                [leaf[:, :points, None], jnp.pad(further, rest, constant_values=fill)], axis=2
-            )
-
-        valid = jnp.concatenate([drawn.valid, drawn.others_valid.reshape(frames, -1)], axis=1)
-        known = jnp.where(valid, jax.lax.stop_gradient(level), -jnp.inf)
-        best = jnp.argmax(by_root(known, -jnp.inf), axis=2, keepdims=True)
-
-        def chosen(leaf: Array) -> Array:
-            index = best.reshape(*best.shape, *(1,) * (leaf.ndim - 2))
-            return jnp.take_along_axis(by_root(leaf, 0), index, axis=2)[:, :, 0]
-
+        one_frame = jax.vmap(self._one_frame, in_axes=(None, 0, 1))
+        x_c, found, level, regular, bone_level = one_frame(model, drawn, padded)
         return PointBatch(
             x_d=drawn.x_d,
-            x_c=chosen(x_c),
+            x_c=x_c,
             part=drawn.part,
             distance=drawn.distance,
-            found=chosen(valid),
-            level=chosen(level),
-            regular=chosen(regular),
+            found=found,
+            level=level,
+            regular=regular,
             bone_level=bone_level.T.reshape(-1)[: len(on_bones)],
             transforms=drawn.transforms,
             params=drawn.params,
         )
 
     def _one_frame(
-        self,
-        model: AvatarModel,
-        x_c: Float[Array, "P 3"],
-        x_d: Float[Array, "P 3"],
-        on_bones: Float[Array, "S 3"],
-        transforms: Float[Array, "J 4 4"],
-        params: BodyParams,
-    ) -> tuple[Array, Array, Array, Array]:
-        regular = jnp.ones(len(x_c), bool)
+        self, model: AvatarModel, drawn: DrawnPoints, on_bones: Float[Array, "S 3"]
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        geometry, points = model.geometry, len(drawn.root)
+        condition = geometry.condition(drawn.params)
+        # One call for all points: what a condition costs is paid once, and compiled once.
+        places = [drawn.neutral, drawn.others_neutral.reshape(-1, 3), on_bones]
+        level = jax.vmap(lambda x: geometry.carried_value(x, condition).level)(
+            jnp.concatenate(places)
+        )
+        level, bone_level = level[: -len(on_bones) or None], level[len(level) - len(on_bones) :]
+
+        def by_root(first: Array, others: Array, fill: float) -> Array:
+            """Every root of a point; `fill` for those that only the first points can have."""
+            room = ((0, points - len(others)), (0, 0), *((0, 0),) * (others.ndim - 2))
+            others = jnp.pad(others, room, constant_values=fill)
+            return jnp.concatenate([first[:, None], others], axis=1)
+
+        level = by_root(level[:points], level[points:].reshape(drawn.others_valid.shape), 0.0)
+        valid = by_root(drawn.valid, drawn.others_valid, False)
+        roots = by_root(drawn.root, drawn.others, 0.0)
+        best = jnp.argmax(jnp.where(valid, jax.lax.stop_gradient(level), -jnp.inf), axis=1)
+
+        def chosen(leaf: Array) -> Array:
+            index = best.reshape(-1, *(1,) * (leaf.ndim - 1))
+            return jnp.take_along_axis(leaf, index, axis=1)[:, 0]
+
+        x_c, level, regular = chosen(roots), chosen(level), jnp.ones(points, bool)
         if self.through_root:
             refine = jax.vmap(implicit_root, in_axes=(0, 0, None, None))
-            x_c, _, regular = refine(x_c, x_d, model.skinning, transforms)
-        condition = model.geometry.condition(params)
-        # One call for all points: what a condition costs is paid once, and compiled once.
-        places = jnp.concatenate([x_c, on_bones])
-        level = jax.vmap(lambda x: model.geometry(x, condition).level)(places)
-        return x_c, level[: len(x_c)], regular, level[len(x_c) :]
-
-
-def _with_best_root(model: AvatarModel, drawn: DrawnPoints) -> DrawnPoints:
-    """The same points with the best of their roots alone, or with the first if none is valid."""
-    rows = drawn.others.shape[1]
-    if not rows or not drawn.others.shape[2]:
-        return drawn
-    roots = jnp.concatenate([drawn.root[:, :rows, None], drawn.others], axis=2)
-    usable = jnp.concatenate([drawn.valid[:, :rows, None], drawn.others_valid], axis=2)
-    conditions = jax.vmap(model.geometry.condition)(drawn.params)
-    choose = jax.vmap(best_root, in_axes=(None, 0, 0, 0))
-    best, found = choose(model.geometry, roots, usable, conditions)
-    best = jnp.where(found[..., None], best, drawn.root[:, :rows])
-    return drawn._replace(
-        root=drawn.root.at[:, :rows].set(best),
-        valid=drawn.valid.at[:, :rows].set(found),
-        others=drawn.others[:, :0],
-        others_valid=drawn.others_valid[:, :0],
-    )
+            x_c, _, regular = refine(x_c, drawn.x_d, model.skinning, drawn.transforms)
+            level = jax.vmap(lambda x: geometry(x, condition).level)(x_c)
+        return x_c, jnp.any(valid, axis=1), level, regular, bone_level
 
 
 class LevelTerm(eqx.Module):

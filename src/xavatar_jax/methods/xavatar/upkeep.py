@@ -35,7 +35,7 @@ class RootPolish:
     def __call__(self, model: AvatarModel, data: FrameData, step: int) -> FrameData:
         rows = rows_in_turn(step // self.every, self.frames, data.num_frames)
         table = tabulated(model.skinning, self.grids)
-        return polish_roots(model.skinning, table, data, steps=1, rows=rows)
+        return polish_roots(model, table, data, steps=1, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Redraw:
         new = self._waiting.result()
         if new.roots is not None:
             table = tabulated(model.skinning, self._grids)
-            new = polish_roots(model.skinning, table, new, steps=2)
+            new = polish_roots(model, table, new, steps=2)
         data = replace_frames(data, new, self._rows(step // self.every))
         self.begin(step)
         return data
