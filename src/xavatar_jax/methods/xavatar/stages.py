@@ -300,17 +300,16 @@ class LevelsAtRoots(eqx.Module):
         level = jax.vmap(lambda x: geometry.carried_value(x, condition).level)(
             jnp.concatenate(places)
         )
-        level, bone_level = level[: -len(on_bones) or None], level[len(level) - len(on_bones) :]
+        level, bone_level = jnp.split(level, [len(level) - len(on_bones)])
 
-        def by_root(first: Array, others: Array, fill: float) -> Array:
-            """Every root of a point; `fill` for those that only the first points can have."""
-            room = ((0, points - len(others)), (0, 0), *((0, 0),) * (others.ndim - 2))
-            others = jnp.pad(others, room, constant_values=fill)
-            return jnp.concatenate([first[:, None], others], axis=1)
+        def by_root(first: Array, others: Array) -> Array:
+            """Every root of a point. Only the first points have others: the rest gets zeros."""
+            room = ((0, points - len(others)), *((0, 0),) * (others.ndim - 1))
+            return jnp.concatenate([first[:, None], jnp.pad(others, room)], axis=1)
 
-        level = by_root(level[:points], level[points:].reshape(drawn.others_valid.shape), 0.0)
-        valid = by_root(drawn.valid, drawn.others_valid, False)
-        roots = by_root(drawn.root, drawn.others, 0.0)
+        level = by_root(level[:points], level[points:].reshape(drawn.others_valid.shape))
+        valid = by_root(drawn.valid, drawn.others_valid)
+        roots = by_root(drawn.root, drawn.others)
         best = jnp.argmax(jnp.where(valid, jax.lax.stop_gradient(level), -jnp.inf), axis=1)
 
         def chosen(leaf: Array) -> Array:
