@@ -220,7 +220,7 @@ def test_bad_parameters_name_the_file(toy_body, tmp_path, changes, message):
 def test_missing_parameters_and_partners_are_named(toy_body, tmp_path):
     write_frame(tmp_path / "k", "a", toy_body, 0)
     np.savez(tmp_path / "k/a.npz", body_pose=np.zeros(63), transl=np.zeros(3))
-    with pytest.raises(ValueError, match="no global_orient or root_orient; found body_pose, tra"):
+    with pytest.raises(ValueError, match=r"no global_orient or .*; found body_pose, tra"):
         load_frames(tmp_path / "k", toy_body)
     write_frame(tmp_path / "m", "a", toy_body, 0)
     write_frame(tmp_path / "m", "b", toy_body, 0)

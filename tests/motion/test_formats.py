@@ -146,7 +146,7 @@ def test_a_bad_frame_is_named(tmp_path, body):
     good = pickle.loads(bad.read_bytes())
     for change, message in (
         ({"body_pose": np.full(63, np.nan)}, "body_pose is not finite"),
-        ({"body_pose": np.zeros(69)}, "23 joints, which is SMPL"),
+        ({"body_pose": np.zeros(69)}, "poses of smpl, but of smplx in"),
         ({"body_pose": np.zeros(60)}, r"body_pose has shape \(60,\), expected"),
         ({"body_pose": np.zeros((21, 3, 3))}, "a matrix that is no rotation"),
         ({"transl": np.zeros(2)}, r"transl has shape \(2,\)"),
@@ -471,8 +471,8 @@ def test_archives_of_other_models_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", surface_model_type="animal_dog", **arrays)
     with pytest.raises(ValueError, match="surface_model_type is 'animal_dog'"):
         load_motion(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", **(arrays | {"poses": np.zeros((2, 72))}))
-    with pytest.raises(ValueError, match=r"\(2, 72\).*72 numbers are SMPL's"):
+    np.savez(tmp_path / "b.npz", **(arrays | {"poses": np.zeros((2, 75))}))
+    with pytest.raises(ValueError, match=r"\(2, 75\).*\(T, 72\) for SMPL"):
         load_motion(tmp_path / "b.npz")
 
 

@@ -153,7 +153,7 @@ def test_missing_keys_list_what_was_sought_and_found(tmp_path, drop, message):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("poses", np.zeros((5, 72)), r"poses has shape \(5, 72\).*165"),
+        ("poses", np.zeros((5, 75)), r"poses has shape \(5, 75\).*165"),
         ("trans", np.full((5, 3), np.nan), "transl is not finite in 5 frames, first in frame 0"),
         ("trans", np.zeros((4, 3)), r"transl has shape \(4, 3\), expected \(5, 3\)"),
         ("mocap_frame_rate", np.array(0.0), "frame rate 0.0"),

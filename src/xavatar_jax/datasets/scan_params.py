@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..body import BodyModel, BodyParams, hands_to_absolute, pose_groups
-from ..motion.params import ALIASES, read_named
+from ..motion.content import ALIASES
+from ..motion.params import read_named
 from ..motion.values import rotation_vectors, text
 from .capture import one_shape
 

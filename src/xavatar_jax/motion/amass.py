@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ..body import SMPLH_TREE, SMPLX_TREE
+from ..body import SMPL_TREE, SMPLH_TREE, SMPLX_TREE
 from ..files import atomic_path
-from .format import DEFAULT_FPS, Format, ReadOptions, Source
+from .content import joint_count
+from .format import BODY_ONLY, DEFAULT_FPS, Format, ReadOptions, Source
 from .record import Motion, MotionNotice
 from .values import (
     Side,
     absolute_hands,
+    check_radians,
     listing,
     one_shape,
     rotation_vectors,
@@ -32,6 +34,7 @@ _FPS_KEYS = ("mocap_frame_rate", "mocap_framerate", "fps")
 _SPLIT = {"root_orient": 1, "pose_body": 21, "pose_jaw": 1, "pose_eye": 2, "pose_hand": 30}
 _OPTIONAL = ("pose_jaw", "pose_eye", "pose_hand")
 _KEYS = {"trans", "poses", "dmpls", "mocap_time_length", *_FPS_KEYS, *_SPLIT}
+_MODELS = {SMPLX_TREE.names: "smplx", SMPLH_TREE.names: "smplh", SMPL_TREE.names: "smpl"}
 _GENDERS = ("neutral", "male", "female")
 
 
@@ -39,7 +42,11 @@ def _recognise(source: Source) -> bool:
     # One key alone may stand in any archive; names of SMPL-X's parameters are another format.
     others = {"global_orient", "body", "smplx_params", "smpl_params"}
     known = source.keys & _KEYS
-    return source.kind in ("npz", "pickle") and len(known) > 1 and not source.keys & others
+    if len(known) < 2 or source.keys & others:
+        return False
+    # AMASS has no SMPL; its layout is used with it where a rate is given.
+    smpl = "poses" in known and joint_count(source.data["poses"]) == SMPL_TREE.num_joints
+    return not smpl or bool(known & set(_FPS_KEYS))
 
 
 def _read(source: Source, options: ReadOptions) -> Motion:
@@ -48,6 +55,9 @@ def _read(source: Source, options: ReadOptions) -> Motion:
     transl = _array(data, ("trans", "transl"), path)
     notices: list[str] = []
     poses, names = _poses(data, path, options, notices)
+    check_radians(poses, "poses", path)
+    if names == SMPL_TREE.names and not (options.body and options.body.kind == "smpl"):
+        notices.append(BODY_ONLY)
     betas = np.zeros(0)
     if "betas" not in data:
         notices.append("no betas: the mean shape is used")
@@ -69,7 +79,7 @@ def _read(source: Source, options: ReadOptions) -> Motion:
         gender=text(data["gender"]).lower() if "gender" in data else "unknown",
         source=str(path),
         notices=tuple(f"{path}: {notice}" for notice in notices),
-        model="smplh" if names == SMPLH_TREE.names else "smplx",
+        model=_MODELS[names],
     )
 
 
@@ -153,9 +163,10 @@ def _refuse_other_models(data: dict[str, Any], path: Path) -> None:
     if "surface_model_type" not in data:
         return
     model = text(data["surface_model_type"]).lower()
-    if not model.startswith(("smplx", "smplh", "smpl+h", "unknown")):
+    if not model.startswith(("smpl", "unknown")):
         raise ValueError(
-            f"{path}: surface_model_type is {model!r}; archives of SMPL-X and SMPL-H are read."
+            f"{path}: surface_model_type is {model!r}; archives of SMPL-X, SMPL-H and SMPL "
+            "are read."
         )
 
 
@@ -177,13 +188,12 @@ def _poses(
         return _split_poses(data, path, options, notices)
     poses = np.asarray(data["poses"], np.float64)
     poses = poses.reshape(len(poses), -1) if poses.ndim else poses
-    by_width = {3 * len(names): names for names in (SMPLX_TREE.names, SMPLH_TREE.names)}
+    by_width = {3 * len(names): names for names in _MODELS}
     names = by_width.get(poses.shape[-1] if poses.ndim == 2 else -1)
     if names is None:
-        smpl = " 72 numbers are SMPL's." if poses.shape[-1:] == (72,) else ""
         raise ValueError(
             f"{path}: poses has shape {np.shape(data['poses'])}; expected (T, 165) for "
-            f"SMPL-X or (T, 156) for SMPL-H, axis-angle.{smpl}"
+            "SMPL-X, (T, 156) for SMPL-H or (T, 72) for SMPL, axis-angle."
         )
     return poses.reshape(len(poses), len(names), 3), names
 

@@ -12,13 +12,11 @@ import numpy as np
 from ..body import SMPLX_TREE
 from .format import Format, ReadOptions, Source
 from .record import Motion
-from .values import text
+from .values import check_radians, text
 
 
 def _recognise(source: Source) -> bool:
-    if source.kind not in ("npz", "pickle") or "body" not in source.keys:
-        return False
-    body = source.data["body"]
+    body = source.data["body"] if "body" in source.keys else None
     return isinstance(body, dict) and isinstance(body.get("params"), dict)
 
 
@@ -35,6 +33,7 @@ def _read(source: Source, options: ReadOptions) -> Motion:
     pose = np.asarray(params["fullpose"], np.float64)
     if pose.ndim != 2 or pose.shape[1] != 3 * SMPLX_TREE.num_joints:
         raise ValueError(f"{path}: fullpose has shape {pose.shape}, expected (T, 165).")
+    check_radians(pose.reshape(len(pose), -1, 3), "fullpose", path)
     template = data["body"].get("vtemp")
     return Motion(
         poses=pose.reshape(len(pose), -1, 3),

@@ -103,6 +103,6 @@ FORMAT = Format(
     name="phalp",
     title="4D-Humans or PHALP results (body only)",
     sought="a joblib pickle of a dictionary by frame with smpl and tid in every frame",
-    recognise=lambda source: source.kind == "pickle" and bool(_frames(source.data)),
+    recognise=lambda source: bool(_frames(source.data)),
     read=_read,
 )

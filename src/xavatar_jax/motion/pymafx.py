@@ -23,8 +23,6 @@ _SMPL_JOINTS = 24
 
 
 def _recognise(source: Source) -> bool:
-    if source.kind not in ("pickle", "npz"):
-        return False
     smoothed = {"body_pose", "left_hand_pose", "expression"} <= source.keys
     return "smplx_params" in source.keys or (smoothed and not source.keys & {"global_orient"})
 

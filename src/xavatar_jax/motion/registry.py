@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from ..body import BodyModel
 from . import (
@@ -20,9 +21,11 @@ from . import (
     xavatar,
     xhumans,
 )
+from .content import explain
 from .format import Format, ReadOptions, Source, open_source
 from .record import Motion, MotionNotice, UpAxis
 
+_T = TypeVar("_T")
 FORMATS: dict[str, Format] = {
     module.FORMAT.name: module.FORMAT
     for module in (
@@ -76,7 +79,8 @@ def load_motion(
         body=body, fps=fps, up=up, person=person, joint_map=joint_map, scale=scale,
         flat_hand_mean=flat_hand_mean,
     )  # fmt: skip
-    motion = _read(_chosen(source, format), source, options)
+    chosen = _guarded(source, "a motion", lambda: _chosen(source, format))
+    motion = _guarded(source, chosen.title, lambda: chosen.read(source, options))
     for notice in motion.notices:
         warnings.warn(notice, MotionNotice, stacklevel=2)
     return motion
@@ -124,13 +128,13 @@ def save_motion(
     return writer[name](path, motion, body)
 
 
-def _read(chosen: Format, source: Source, options: ReadOptions) -> Motion:
-    """The motion; whatever a damaged file makes a reader raise names the file."""
+def _guarded(source: Source, title: str, call: Callable[[], _T]) -> _T:
+    """What the call returns; whatever a damaged file makes it raise names the file."""
     try:
-        return chosen.read(source, options)
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        return call()
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError) as error:
         raise ValueError(
-            f"{source.path}: looks like {chosen.title}, but cannot be read as such "
+            f"{source.path}: looks like {title}, but cannot be read as such "
             f"({type(error).__name__}: {error})."
         ) from error
     except ValueError as error:
@@ -150,7 +154,11 @@ def _chosen(source: Source, name: str | None) -> Format:
                 f"{source.describe()}."
             )
         return chosen
-    fitting = [entry for entry in FORMATS.values() if entry.recognise(source)]
+    own = [entry for entry in FORMATS.values() if entry is not params.FORMAT]
+    # Parameters by name are in files of other formats too, which know more of them.
+    fitting = [entry for entry in own if entry.recognise(source)] or [
+        entry for entry in (params.FORMAT,) if entry.recognise(source)
+    ]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
@@ -158,6 +166,9 @@ def _chosen(source: Source, name: str | None) -> Format:
         raise ValueError(
             f"{source.path}: could be {names}; found {source.describe()}. Say which with format=."
         )
+    reason = explain(source)
+    if reason:
+        raise ValueError(f"{source.path}: {reason}")
     sought = "".join(f"\n  {entry.name}: {entry.sought}" for entry in FORMATS.values())
     raise ValueError(
         f"{source.path}: not recognised as a motion; found {source.describe()}. Looked for{sought}"

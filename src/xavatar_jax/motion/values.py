@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,26 @@ Side = Literal["left", "right"]
 # Rotation matrices in files are rounded to float32 or half, networks' are not quite orthogonal.
 _ORTHOGONAL = 1e-2
 _NUM_BETAS = 10  # of X-Humans
+
+
+def numbers(values: Any, name: str, where: str | Path) -> np.ndarray:
+    """An array of real numbers, float64.
+
+    Raises:
+        ValueError: naming file, field and what it holds instead.
+    """
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "biuf" or array.size == 0:
+            return array.astype(np.float64)
+        if array.dtype.kind == "O" and array.size and not isinstance(array.flat[0], str | bytes):
+            return array.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ValueError(
+        f"{where}: {name} holds {reprlib.repr(values)} ({type(values).__name__}), expected an "
+        "array of real numbers."
+    )
 
 
 def rotation_vectors(
@@ -35,7 +56,7 @@ def rotation_vectors(
     Raises:
         ValueError: another shape, values that are not finite, or matrices that are no rotations.
     """
-    array = np.asarray(values, np.float64)
+    array = numbers(values, name, where)
     readings = []
     if array.ndim >= 2 and array.shape[-2:] == (3, 3) and array.size % (9 * joints) == 0:
         readings.append(("matrix", array.size // (9 * joints)))
@@ -52,6 +73,7 @@ def rotation_vectors(
     array = array.reshape(frames, joints, -1)
     check_finite(array, name, where)
     if kind == "vector":
+        check_radians(array, name, where)
         return array
     return _from_matrices(array.reshape(frames, joints, 3, 3), name, where)
 
@@ -86,6 +108,22 @@ def check_finite(values: np.ndarray, name: str, where: str | Path) -> None:
         )
 
 
+def check_radians(poses: Float[np.ndarray, "T J 3"], name: str, where: str | Path) -> None:
+    """Check that rotations of joints can be radians: no joint turns twice round.
+
+    The first rotation may be that of the body, which does turn round, and is left out.
+
+    Raises:
+        ValueError: naming the largest rotation.
+    """
+    most = float(np.linalg.norm(poses[:, 1:], axis=-1).max(initial=0.0))
+    if most > 4 * np.pi:
+        raise ValueError(
+            f"{where}: {name} holds a rotation of {most:.4g}, which no joint makes in radians: "
+            "poses can only be in degrees. Convert them with np.radians, and save them again."
+        )
+
+
 def per_frame(
     values: Any, count: int, *, name: str, where: str | Path, width: int | None = None
 ) -> Float[np.ndarray, "T n"]:
@@ -94,7 +132,7 @@ def per_frame(
     Raises:
         ValueError: neither `count` vectors nor one, or of another width.
     """
-    array = np.asarray(values, np.float64)
+    array = numbers(values, name, where)
     size = array.shape[-1] if array.ndim else 1
     if array.size == 0 and width is None:
         return np.zeros((count, 0))
@@ -146,7 +184,7 @@ def absolute_hands(
     Raises:
         ValueError: a body is needed and none was given, or has no such hand or components.
     """
-    array = np.asarray(values, np.float64)
+    array = numbers(values, name, where)
     columns = array.size // max(count, 1)
     components = array.size == count * columns and 0 < columns < 45
     if not components:

@@ -28,7 +28,7 @@ _WIDTHS = {_FIXED + 2 * count for count in (6, 12, 24, 45)}
 
 def _vectors(source: Source) -> np.ndarray | None:
     data = source.data.get(_KEY) if source.keys else source.data
-    if source.kind not in ("npz", "npy", "pickle") or not isinstance(data, np.ndarray):
+    if not isinstance(data, np.ndarray):
         return None
     return data if data.ndim in (1, 2) and data.shape[-1] in _WIDTHS else None
 
