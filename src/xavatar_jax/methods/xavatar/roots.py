@@ -145,20 +145,23 @@ def _with_neutral(geometry: AbstractGeometryField, data: FrameData) -> FrameData
     cache = data.roots
     assert cache is not None
 
-    def one_frame(frame: tuple[BodyParams, Array, Array]) -> tuple[Array, Array]:
-        params, first, others = frame
-        flat = _neutral(geometry, jnp.concatenate([first, others.reshape(-1, 3)]), params)
-        return flat[: len(first)], flat[len(first) :].reshape(others.shape)
-
-    found = jax.lax.map(one_frame, (data.params, cache.first, cache.others))
+    found = jax.lax.map(
+        lambda frame: _neutral(geometry, *frame), (data.params, cache.first, cache.others)
+    )
     return eqx.tree_at(lambda d: (d.roots.neutral, d.roots.others_neutral), data, found)
 
 
 def _neutral(
-    geometry: AbstractGeometryField, x_c: Float[Array, "n 3"], params: BodyParams
-) -> Float[Array, "n 3"]:
+    geometry: AbstractGeometryField,
+    params: BodyParams,
+    first: Float[Array, "N 3"],
+    others: Float[Array, "Q K 3"],
+) -> tuple[Float[Array, "N 3"], Float[Array, "Q K 3"]]:
+    """The neutral points of one frame's roots."""
     condition = geometry.condition(params)
-    return jax.vmap(lambda x: geometry.carried_from(x, condition)[0])(x_c)
+    flat = jnp.concatenate([first, others.reshape(-1, 3)])
+    flat = jax.vmap(lambda x: geometry.carried_from(x, condition)[0])(flat)
+    return flat[: len(first)], flat[len(first) :].reshape(others.shape)
 
 
 def _sorted_by_roots(
@@ -237,39 +240,38 @@ def _polish(
 ) -> tuple[Array, ...]:
     def one_frame(frame: tuple) -> tuple:
         (x_d, transforms, params, found, several), roots = frame
-        first, neutral, _, others, others_neutral, others_valid = roots
+        first, _, _, others, _, others_valid = roots
         grid = pose_grid(table, transforms)
 
-        def move(x_c: Array, x_d: Array) -> tuple[Array, Array, Array]:
-            x_c, ok = move_roots(
+        def move(x_c: Array, x_d: Array) -> tuple[Array, Array]:
+            return move_roots(
                 model.skinning, grid, x_c, x_d, transforms, steps=steps, atol=POLISH_TOLERANCE,
                 max_step=POLISH_LIMIT,
             )  # fmt: skip
-            return x_c, _neutral(model.geometry, x_c, params), ok
 
-        first, neutral, ok = _by_blocks(move, (first, neutral), x_d, found)
+        first, ok = _by_blocks(move, first, x_d, found)
         width, each = others.shape[:2]
-        flat = others.reshape(-1, 3), others_neutral.reshape(-1, 3)
         targets = jnp.repeat(x_d[:width], each, axis=0)
-        *moved, others_ok = _by_blocks(move, flat, targets, several * each)
-        others, others_neutral = (leaf.reshape(others.shape) for leaf in moved)
+        moved, others_ok = _by_blocks(move, others.reshape(-1, 3), targets, several * each)
+        others = moved.reshape(others.shape)
         others_ok = others_ok.reshape(others_valid.shape) & others_valid
+        neutral, others_neutral = _neutral(model.geometry, params, first, others)
         return first, neutral, ok, others, others_neutral, others_ok
 
     return jax.lax.map(one_frame, stored)
 
 
 def _by_blocks(
-    move: Callable[[Array, Array], tuple[Array, Array, Array]],
-    roots: tuple[Float[Array, "n 3"], Float[Array, "n 3"]],
+    move: Callable[[Array, Array], tuple[Array, Array]],
+    x_c: Float[Array, "n 3"],
     x_d: Float[Array, "n 3"],
     count: Int[Array, ""],
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Move the first `count` roots with their neutral points, and call the rest no roots.
+) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
+    """Move the first `count` points, which is all that have a root, and call the rest no roots.
 
     In blocks, so that what is left out costs nothing.
     """
-    total = len(x_d)
+    total = len(x_c)
     number = -(-total // _BLOCK)
     size = -(-total // max(number, 1))
 
@@ -278,14 +280,13 @@ def _by_blocks(
 
     targets = blocks(x_d)
 
-    def body(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        new = move(state[0][k], targets[k])
-        return jax.tree.map(lambda whole, part: whole.at[k].set(part), state, new)
+    def body(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        moved, ok = move(state[0][k], targets[k])
+        return state[0].at[k].set(moved), state[1].at[k].set(ok)
 
-    start = *map(blocks, roots), jnp.zeros((number, size), bool)
-    x_c, neutral, ok = jax.lax.fori_loop(0, (count + size - 1) // max(size, 1), body, start)
-    ok = ok.reshape(-1)[:total] & (jnp.arange(total) < count)
-    return x_c.reshape(-1, 3)[:total], neutral.reshape(-1, 3)[:total], ok
+    start = blocks(x_c), jnp.zeros((number, size), bool)
+    moved, ok = jax.lax.fori_loop(0, (count + size - 1) // max(size, 1), body, start)
+    return moved.reshape(-1, 3)[:total], ok.reshape(-1)[:total] & (jnp.arange(total) < count)
 
 
 def replace_frames(data: FrameData, new: FrameData, rows: Int[np.ndarray, " r"]) -> FrameData:
