@@ -39,12 +39,7 @@ def build_model(
 
     It is laid out for the body's mean shape, or for the person of `betas`.
     """
-    key_skinning, key_geometry = jax.random.split(key)
-    return AvatarModel(
-        _skinning(body, spec.skinning, key_skinning, betas),
-        _geometry(body, spec.geometry, key_geometry, betas),
-        build_link(spec.link),
-    )
+    return _model(spec, body, key, betas, betas)
 
 
 def mean_shape_model(
@@ -54,10 +49,20 @@ def mean_shape_model(
 
     `lay_on_person` then makes it what `build_model` gives, but for what was fitted.
     """
+    return _model(spec, body, key, betas, None)
+
+
+def _model(
+    spec: ModelSpec,
+    body: BodyModel,
+    key: PRNGKeyArray,
+    skinning_betas: _Betas | None,
+    geometry_betas: _Betas | None,
+) -> AvatarModel:
     key_skinning, key_geometry = jax.random.split(key)
     return AvatarModel(
-        _skinning(body, spec.skinning, key_skinning, betas),
-        _geometry(body, spec.geometry, key_geometry, None),
+        _skinning(body, spec.skinning, key_skinning, skinning_betas),
+        _geometry(body, spec.geometry, key_geometry, geometry_betas),
         build_link(spec.link),
     )
 

@@ -87,17 +87,17 @@ People = dict[int, list[tuple[Parameters, int | None]]]
 def canonical(data: Mapping[Any, Any], path: tuple[str, ...] = ()) -> Parameters:
     """The entries of a dictionary by SMPL-X's names; parameters of the world before a camera's."""
     given = {str(key): value for key, value in data.items() if value is not None}
-    renamed: dict[str, tuple[str, Any]] = {}
+    plain = renamed = _renamed({k: k for k in given}, given)
     space: Space | None = next(
         (s for part in path for e, s in _ENDINGS.items() if e and part.endswith(e)), None
     )
     for ending, ends_in in _ENDINGS.items():
-        renamed = _renamed({k: k for k in given}, given)
+        renamed = plain
         if ending:
             ended = _renamed(
                 {k.removesuffix(ending): k for k in given if k.endswith(ending)}, given
             )
-            renamed = {k: v for k, v in renamed.items() if k not in _PLACES} | ended
+            renamed = {k: v for k, v in plain.items() if k not in _PLACES} | ended
             if not ended.keys() & {"global_orient", "poses"}:
                 continue
         if renamed.keys() & {"global_orient", "poses"}:
@@ -106,17 +106,10 @@ def canonical(data: Mapping[Any, Any], path: tuple[str, ...] = ()) -> Parameters
     if space is None and any(name in given for name in ("cam", "pred_cam", "cam_trans")):
         space = "camera"
     if {"global_orient", "body_pose"} <= renamed.keys():
-        renamed.pop("poses", None)
+        renamed = {k: v for k, v in renamed.items() if k != "poses"}
     used = {key for key, _ in renamed.values()} | _METADATA
     values = {name: value for name, (_, value) in renamed.items()}
     return Parameters(values, path, space, tuple(sorted(given.keys() - used)))
-
-
-def _space(path: tuple[str, ...]) -> Space | None:
-    for ending, space in _ENDINGS.items():
-        if ending and any(part.endswith(ending) for part in path):
-            return space
-    return None
 
 
 def _renamed(keys: dict[str, str], given: dict[str, Any]) -> dict[str, tuple[str, Any]]:

@@ -144,7 +144,6 @@ def _search_frame(
 def _with_neutral(geometry: AbstractGeometryField, data: FrameData) -> FrameData:
     cache = data.roots
     assert cache is not None
-
     found = jax.lax.map(
         lambda frame: _neutral(geometry, *frame), (data.params, cache.first, cache.others)
     )
@@ -180,11 +179,12 @@ def _sorted_by_roots(
         return np.take_along_axis(values, index, axis=1)
 
     roots, valid = sort(roots), sort(valid)
+    first, others = jnp.asarray(roots[:, :, 0]), jnp.asarray(roots[:, :width, 1:])
     cache = RootCache(
-        first=(first := jnp.asarray(roots[:, :, 0])),
+        first=first,
         neutral=first,
         valid=jnp.asarray(valid[:, :, 0]),
-        others=(others := jnp.asarray(roots[:, :width, 1:])),
+        others=others,
         others_neutral=others,
         others_valid=jnp.asarray(valid[:, :width, 1:]),
         found=jnp.asarray((count > 0).sum(1), jnp.int32),
@@ -223,7 +223,7 @@ def polish_roots(
         return c.first, c.neutral, c.valid, c.others, c.others_neutral, c.others_valid
 
     of_frame = data.samples.x_d, data.transforms, data.params, cache.found, cache.several
-    stored = of_frame, parts(cache)
+    stored = *of_frame, cache.first, cache.others, cache.others_valid
     if rows is None or len(rows) == data.num_frames:
         moved = _polish(model, table, stored, steps)
     else:
@@ -239,8 +239,7 @@ def _polish(
     model: AvatarModel, table: TabulatedSkinning, stored: tuple, steps: int
 ) -> tuple[Array, ...]:
     def one_frame(frame: tuple) -> tuple:
-        (x_d, transforms, params, found, several), roots = frame
-        first, _, _, others, _, others_valid = roots
+        x_d, transforms, params, found, several, first, others, others_valid = frame
         grid = pose_grid(table, transforms)
 
         def move(x_c: Array, x_d: Array) -> tuple[Array, Array]:

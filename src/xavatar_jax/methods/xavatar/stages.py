@@ -295,8 +295,10 @@ class LevelsAtRoots(eqx.Module):
     ) -> tuple[Array, Array, Array, Array, Array]:
         geometry, points = model.geometry, len(drawn.root)
         condition = geometry.condition(drawn.params)
+        # Levels at single roots are computed below if they go through the root.
+        compared = len(drawn.others) if self.through_root else points
         # One call for all points: what a condition costs is paid once, and compiled once.
-        places = [drawn.neutral, drawn.others_neutral.reshape(-1, 3), on_bones]
+        places = [drawn.neutral[:compared], drawn.others_neutral.reshape(-1, 3), on_bones]
         level = jax.vmap(lambda x: geometry.carried_value(x, condition).level)(
             jnp.concatenate(places)
         )
@@ -304,10 +306,10 @@ class LevelsAtRoots(eqx.Module):
 
         def by_root(first: Array, others: Array) -> Array:
             """Every root of a point. Only the first points have others: the rest gets zeros."""
-            room = ((0, points - len(others)), *((0, 0),) * (others.ndim - 1))
-            return jnp.concatenate([first[:, None], jnp.pad(others, room)], axis=1)
+            room = ((0, compared - len(others)), *((0, 0),) * (others.ndim - 1))
+            return jnp.concatenate([first[:compared, None], jnp.pad(others, room)], axis=1)
 
-        level = by_root(level[:points], level[points:].reshape(drawn.others_valid.shape))
+        level = by_root(level, level[compared:].reshape(drawn.others_valid.shape))
         valid = by_root(drawn.valid, drawn.others_valid)
         roots = by_root(drawn.root, drawn.others)
         best = jnp.argmax(jnp.where(valid, jax.lax.stop_gradient(level), -jnp.inf), axis=1)
@@ -316,12 +318,14 @@ class LevelsAtRoots(eqx.Module):
             index = best.reshape(-1, *(1,) * (leaf.ndim - 1))
             return jnp.take_along_axis(leaf, index, axis=1)[:, 0]
 
-        x_c, level, regular = chosen(roots), chosen(level), jnp.ones(points, bool)
+        x_c = jnp.concatenate([chosen(roots), drawn.root[compared:]])
+        found = jnp.concatenate([jnp.any(valid, axis=1), drawn.valid[compared:]])
+        level, regular = chosen(level), jnp.ones(points, bool)
         if self.through_root:
             refine = jax.vmap(implicit_root, in_axes=(0, 0, None, None))
             x_c, _, regular = refine(x_c, drawn.x_d, model.skinning, drawn.transforms)
             level = jax.vmap(lambda x: geometry(x, condition).level)(x_c)
-        return x_c, jnp.any(valid, axis=1), level, regular, bone_level
+        return x_c, found, level, regular, bone_level
 
 
 class LevelTerm(eqx.Module):
